@@ -5,12 +5,13 @@ import hashlib
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose
@@ -86,6 +87,8 @@ def matcher_hash(spec: str, version: str, code: bytes, settings: str) -> str:
 Need = Literal["position", "yaw", "scale", "vectors", "image", "imagery", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
 MOST_SAID: Final = 4000  # characters of a field of a card
+FORBID_MORE: Final = ConfigDict(extra="forbid")  # of a card as a process sends it
+MOST_LISTED: Final = 1000  # items of a field
 MOST_SHOWN: Final = 80  # of a wrong one
 MOST_LEARNED_BYTES: Final = 2**20  # of a learned text, as UTF-8
 SAME_PLACE_M: Final = 0.05  # a candidate is returned unchanged, except for rounding
@@ -145,37 +148,31 @@ class MatcherCard:
     contact: str = ""
     code: str = ""
 
+    __pydantic_config__ = FORBID_MORE
+
     def __post_init__(self) -> None:
         """Refuse a card without the facts that a reader of the board needs."""
-        check_said(self)
-        check_identity(self.name, self.version)
-        for name, known in (("tracks", get_args(Track)), ("needs", NEEDS)):
-            wrong = next((item for item in getattr(self, name) if item not in known), None)
-            if wrong is not None:
-                raise MatchError(f"card: {name} holds {wrong!r}, known are {', '.join(known)}")
+        check_card(asdict(self), tracks=get_args(Track), needs=NEEDS)
         if not self.tracks:
             raise MatchError("card: tracks is empty, name retrieval, localization or both")
-        for name in ("trained_on", "uses", "authors"):
-            for item in getattr(self, name):
-                check_line(name, item)
-        check_line("contact", self.contact)
-        check_line("code", self.code)
 
 
-def check_said(card: object) -> None:
-    """Refuse a card on which one of the fields that every card has is empty or no line."""
+def check_card(said: Mapping[str, object], **known: Sequence[str]) -> None:
+    """Refuse a card of any kind, by its fields, that lacks a fact, or holds no lines, or none of the `known` values."""
     for name in ("name", "version", "title", "source", "ours", "licence"):
-        value = getattr(card, name)
+        value = said[name]
         if not isinstance(value, str) or not value.strip():
             raise MatchError(f"card: {name} is empty, say it in one line")
-        check_line(name, value)
-    check_line("limits", getattr(card, "limits"))  # noqa: B009 - of either kind of card
-
-
-def check_line(name: str, value: object) -> None:
-    """Refuse a card on which a field is no line."""
-    if not isinstance(value, str) or not value.isprintable() or len(value) > MOST_SAID:
-        raise MatchError(f"card: {name} must be one line of at most {MOST_SAID} printable characters")
+    for name, value in said.items():
+        items = value if isinstance(value, tuple | list) else () if isinstance(value, bool) else (value,)
+        wrong = next((item for item in items if item not in known[name]), None) if name in known else None
+        if wrong is not None:
+            raise MatchError(f"card: {name} holds {wrong!r}, known are {', '.join(known[name])}")
+        if len(items) > MOST_LISTED:
+            raise MatchError(f"card: {name} holds {len(items)} lines, expected at most {MOST_LISTED}")
+        if not all(isinstance(item, str) and is_line(item, MOST_SAID) for item in items):
+            raise MatchError(f"card: {name} must be one line of at most {MOST_SAID} printable characters")
+    check_identity(str(said["name"]), str(said["version"]))
 
 
 def check_identity(name: str, version: str) -> None:
@@ -428,8 +425,7 @@ class RejectorCard:
 
     def __post_init__(self) -> None:
         """Refuse a card without the facts that a reader of the board needs."""
-        check_said(self)
-        check_identity(self.name, self.version)
+        check_card(asdict(self))
 
 
 @runtime_checkable

@@ -2,11 +2,11 @@
 """Interface of segmenters: plugins that say, class by class and pixel by pixel, what is on an aerial image."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
 from sasgeo_bench.errors import ImageError, MatchError
-from sasgeo_bench.matching.matcher import check_identity, check_learned, check_line, check_said
+from sasgeo_bench.matching.matcher import FORBID_MORE, check_card, check_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
@@ -50,16 +50,11 @@ class SegmenterCard:
     limits: str = ""
     trained_on: tuple[str, ...] = ()
 
+    __pydantic_config__ = FORBID_MORE
+
     def __post_init__(self) -> None:
         """Refuse a card without the facts that a reader of the board needs."""
-        check_said(self)
-        check_identity(self.name, self.version)
-        for name, known in (("classes", load_taxonomy().names), ("needs", SEGMENTER_NEEDS)):
-            wrong = next((item for item in getattr(self, name) if item not in known), None)
-            if wrong is not None:
-                raise MatchError(f"card: {name} holds {wrong!r}, known are {', '.join(known)}")
-        for place in self.trained_on:
-            check_line("trained_on", place)
+        check_card(asdict(self), classes=load_taxonomy().names, needs=SEGMENTER_NEEDS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.matcher import Match, MatcherCard, check_match
+from sasgeo_bench.matching.matcher import Match, MatcherCard, Prediction, check_match
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.tasks.query import Head, Query
 
 SIDE: Final = 3  # of a covariance: east, north, yaw
 MOST_VARIANCE: Final = 1e12  # m2 or deg2
@@ -114,6 +114,24 @@ def match_of(fix: Fix) -> Match:
         confidence=fix.confidence,
         diagnostics=fix.diagnostics,
     )
+
+
+def check_prediction(found: Prediction, query: Query | Head | None, *, top_k: int) -> Prediction:
+    """Check a row that another process or program made, and return it with floats for numbers.
+
+    Raise `MatchError` as `check_match` and `check_covariance` do.
+    """
+    match = Match(
+        poses=[pose for pose, _ in found.candidates],
+        scores=[score for _, score in found.candidates],
+        confidence=found.confidence,
+        diagnostics=found.diagnostics,
+    )
+    match = check_match(match, query, top_k=top_k)
+    if found.covariance is not None:
+        check_covariance(found.covariance)
+    candidates = tuple(zip(match.poses, match.scores, strict=True))
+    return replace(found, candidates=candidates, confidence=match.confidence, diagnostics=match.diagnostics)
 
 
 def are_covariances(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:

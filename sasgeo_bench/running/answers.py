@@ -6,15 +6,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from typing import Final, Generic, TypeVar
 
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.plugins import ORACLE
-from sasgeo_bench.matching.matcher import Prediction, Status, check_match, lacks
-from sasgeo_bench.matching.tracker import check_covariance
+from sasgeo_bench.matching.matcher import Prediction, Status, lacks
+from sasgeo_bench.matching.tracker import check_prediction
 from sasgeo_bench.regions.region_files import check_files, read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import Oracle
@@ -372,29 +372,19 @@ class _Map:
 
     def _row(self, query: Query, reply: Reply) -> Prediction:
         """Make a row of a reply, checked against the query again in this process."""
-        row = partial(Prediction, query_id=query.query_id)
+        row = Prediction(query_id=query.query_id, status=reply.status, message=reply.message)
         if reply.status != "ok":
-            return row(status=reply.status, message=reply.message)
-        if reply.match is None:
-            return row(status="invalid", message="no answer in an answer")
+            return row
+        if reply.found is None:
+            return replace(row, status="invalid", message="no answer in an answer")
         try:
-            match = check_match(reply.match, query, top_k=self._plan.request.top_k)
-            if reply.covariance is not None:
-                check_covariance(reply.covariance)
-            return row(
-                candidates=tuple(zip(match.poses, match.scores, strict=True)),
-                confidence=match.confidence,
-                diagnostics=match.diagnostics,
-                latency_s=reply.seconds,
-                matcher_s=reply.own_s,
-                is_accepted=reply.is_accepted,
-                covariance=reply.covariance,
-            )
+            found = check_prediction(reply.found, query, top_k=self._plan.request.top_k)
         except MatchError as error:
-            return row(status="invalid", message=one_line(str(error)))
+            return replace(row, status="invalid", message=one_line(str(error)))
         except Exception as error:  # noqa: BLE001 - any failure costs only its own row
             failed = failed_by_us(self._plan, error)
-            return row(status=failed.status, message=failed.message)
+            return replace(row, status=failed.status, message=failed.message)
+        return replace(found, query_id=query.query_id, latency_s=reply.seconds, matcher_s=reply.own_s)
 
     def _failed_training(self) -> Reply | None:
         """Return the reply to every query after a failed training; starts no process."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.plugins import ORACLE, ORACLE_SEGMENTER
-from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
+from sasgeo_bench.matching.matcher import MatcherCard, Prediction
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.running.segmenter_process import SegmenterReply
@@ -32,14 +32,14 @@ CARD: Final = MatcherCard(
     limits="is no method: it reads the answers, so that whatever does not score it as perfect is at fault",
 )
 _SURE: Final = (0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.01)  # covariance of an estimate on a flight: a decimetre
-_ISOLATION: Final = {"truth": "given, as this control needs it"}
+ISOLATION: Final = {"truth": "given, as this control needs it"}
 
 
 class Oracle:
     """Answers with the truths of a task, and withholds where the place is absent; runs in place of a `Worker`."""
 
     def __init__(self, truth_folder: Path) -> None:
-        self.isolation = dict(_ISOLATION)
+        self.isolation = dict(ISOLATION)
         self.peak_bytes = 0
         self._folder = truth_folder
         self._truths: dict[str, Truth] = {}
@@ -73,23 +73,26 @@ class Oracle:
         truth = self._truths.get(asked.query_id)
         if truth is None:
             raise StoreError(f"{self._folder} holds no truth of query {asked.query_id}: make the queries again")
-        found = right_answer(asked, truth)
-        reply = Reply(status="ok", seconds=time.perf_counter() - start, match=found)
-        return reply if asked.step is None else replace(reply, is_accepted=truth.is_present, covariance=_SURE)
+        return Reply(status="ok", found=right_answer(asked, truth), seconds=time.perf_counter() - start)
 
 
-def right_answer(query: Query, truth: Truth) -> Match:
+def right_answer(query: Query, truth: Truth) -> Prediction:
     """Return the right answer: the true pose, the right candidate with true heading and scale, or none.
 
     A flight goes on off the map: its oracle knows where, and does not say that it may be relied on.
     """
     pose = truth.pose
     if pose is None or not (truth.is_present or query.track == SEQUENCE):
-        return WITHHELD
-    if query.track == "retrieval":
+        pose = None
+    elif query.track == "retrieval":
         right = query.candidates[truth.candidate]
         pose = replace(pose, easting_m=right.easting_m, northing_m=right.northing_m)
-    return Match(poses=[pose], scores=[1.0], confidence=1.0)
+    found = Prediction(
+        query_id=query.query_id,
+        candidates=() if pose is None else ((pose, 1.0),),
+        confidence=0.0 if pose is None else 1.0,
+    )
+    return found if query.step is None else replace(found, is_accepted=truth.is_present, covariance=_SURE)
 
 
 SEGMENTER_CARD: Final = SegmenterCard(
@@ -101,7 +104,6 @@ SEGMENTER_CARD: Final = SegmenterCard(
     licence="Apache-2.0",
     limits="is no method: it reads the labels, so that whatever does not score it as perfect is at fault",
 )
-ISOLATION: Final = {"truth": "given, as this control needs it"}
 
 _BYTES: Final = np.zeros(3, dtype=np.uint8)  # of a label: absent is 0
 _BYTES[PRESENT], _BYTES[UNKNOWN] = CERTAIN, SILENT
@@ -125,4 +127,4 @@ def oracle_reply(image: AerialImage | LabelledImage) -> SegmenterReply:
     start = time.perf_counter()
     found = right_segmentation(image)
     seconds = time.perf_counter() - start
-    return SegmenterReply(status="ok", seconds=seconds, own_s=seconds, segmentation=found)
+    return SegmenterReply(status="ok", seconds=seconds, own_s=seconds, found=found)

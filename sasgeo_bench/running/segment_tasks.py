@@ -336,8 +336,8 @@ def _said(run: SegmenterRun, task: Task, faults: list[str]) -> Iterator[Said]:
                 raise StoreError(f"the labels of query {query_id} are missing or out of order: make the queries again")
             of_frame = found[2]
             reply = run.segment(of_frame.labelled(_image(query, number), task.folder.name))
-            faults += [] if reply.segmentation else [f"{query.query_id}: {reply.message} ({reply.status})"]
-            seen.append(reply.segmentation)
+            faults += [] if reply.found else [f"{query.query_id}: {reply.message} ({reply.status})"]
+            seen.append(reply.found)
         yield query, seen
 
 

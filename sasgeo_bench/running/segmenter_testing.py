@@ -1,28 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """The conformance kit of segmenters: the rules that each keeps, checked on tiny images under the limits of a run."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import ClassVar
 
 import numpy as np
 
-from sasgeo_bench.errors import counted
 from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import SEGMENTERS
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.running.segmenter_process import SegmenterProcess, SegmenterReply
-from sasgeo_bench.running.testing import Check, check_of, kept_check, listing_of, loaded_check, refusal_of, taught_check
+from sasgeo_bench.running.testing import Check, Kit
 from sasgeo_bench.running.worker import Limits, Reach
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, write_labelled
 from sasgeo_bench.sensing.segmentation import SILENT, Segmentation
 from sasgeo_bench.sensing.tiny_images import tiny_images, with_picture
-
-_QUICK_S: Final = 5.0
-_Rule = Callable[[str, AerialImage], str | None]  # name and image -> a fault
-_NO_IMAGE: Final = "no image to try it with"
 
 
 def check_segmenter(
@@ -41,19 +36,10 @@ def check_segmenter(
     with ExitStack() as stack:
         folder = stack.enter_context(scratch_folder("check"))
         paths = write_labelled(folder, labelled)
-        before = listing_of(folder)
         reach = Reach(readable=[folder], hidden=[], is_shut_in=is_shut_in)
         process = stack.enter_context(SegmenterProcess(spec=spec, reach=reach, limits=limits or Limits()))
-        loaded = process.load()
-        yield (first := loaded_check(spec, loaded, loaded.card, group=SEGMENTERS))
-        if loaded.card is None or first.outcome == "fail":
-            return
-        kit = _Kit(process=process, card=loaded.card, images={f"image {at}": x.image for at, x in enumerate(labelled)})
-        if loaded.learns:
-            yield from kit.lessons(paths)
-        yield from kit.checks()
-        limited = process.isolation.get("files_changed", "")
-        yield kept_check(kit.refused, before, listing_of(folder), limited)
+        asked = {f"image {at}": one.image for at, one in enumerate(labelled)}
+        yield from _SegmenterKit(process=process, folder=folder, segmenter=process, images=asked, paths=paths).table()
 
 
 def odd_images() -> dict[str, AerialImage]:
@@ -71,136 +57,61 @@ def odd_images() -> dict[str, AerialImage]:
 
 
 @dataclass(kw_only=True)
-class _Kit:
-    process: SegmenterProcess
-    card: SegmenterCard
-    images: Mapping[str, AerialImage]
-    refused: str = ""
-    first: dict[str, SegmenterReply] = field(default_factory=dict)
-    second: dict[str, SegmenterReply] = field(default_factory=dict)
+class _SegmenterKit(Kit[SegmenterCard, Segmentation, AerialImage]):
+    one: ClassVar[str] = "an image"
+    many: ClassVar[str] = "images"
+    group: ClassVar[str] = SEGMENTERS
+    first_rule: ClassVar[str] = "shapes, known classes, and an unchanged picture"
 
-    def lessons(self, paths: Sequence[Path]) -> Iterator[Check]:
-        """Train twice, each time in a process of its own, and ask once without; keep the text for all that follows."""
-        replies = []
-        for _ in range(2):
-            self.process.end()
-            replies.append(self.process.learn(paths))
-        self.process.end()
-        for reply in replies:
-            self.refused = self.refused or refusal_of(reply)
-        yield taught_check(replies[0], replies[1], counted(len(paths), "image"))
-        yield self._untaught()
-        self.process.end()
-        self.process.learned = replies[0].learned
-
-    def _untaught(self) -> Check:
-        """Check that it also answers untrained, unless its card excludes that."""
-        name = "answers without training"
-        if "training" in self.card.needs:
-            return Check(name=name, outcome="not applicable", found="the card needs training")
-        shown, image = next(iter(self.images.items()))
-        fault = _fault(shown, self._ask(image))
-        return check_of(name, fault and f"learned = None: {fault}", "1 image")
+    segmenter: SegmenterProcess
+    images: dict[str, AerialImage]
+    paths: Sequence[Path]
 
     def checks(self) -> Iterator[Check]:
-        if "training" in self.card.needs and self.process.learned is None:
+        if self.learns:
+            few = dict(list(self.images.items())[:1])
+            yield from self.lessons(lambda: self.segmenter.learn(self.paths), few, self.count(len(self.paths)))
+            self.segmenter.learned = self.learned
+        if "training" in self.card.needs and self.learned is None:
             found = "the card needs training, and there is no learned text"
             yield Check(name="answers an image", outcome="not applicable", found=found)
             return
-        yield self._answers()
-        sound = {name: image for name, image in self.images.items() if name in self.second}
-        yield self._over("the same answer twice", sound, self._twice)
-        yield self._over("the same classes everywhere", sound, self._classes)
-        yield self._over("small and odd pictures", odd_images() if sound else {}, self._odd)
-        yield self._order({name: image for name, image in sound.items() if self._twice(name, image) is None})
-        yield self._cost()
+        yield self.answers(self.images, told=self._told)
+        sound = self.sound(self.images)
+        yield self.over("the same answer twice", sound, self.twice)
+        yield self.over("the same classes everywhere", sound, lambda label, _: self._classes(label, self.first[label]))
+        yield self.over("small and odd pictures", odd_images() if sound else {}, self._odd)
+        yield self.order(sound)
+        yield self.cost()
 
-    def _ask(self, image: AerialImage) -> SegmenterReply:
-        reply = self.process.segment(image, classes=self.card.classes)
-        self.refused = self.refused or refusal_of(reply)
-        return reply
+    def ask(self, item: AerialImage) -> SegmenterReply:
+        return self.noted(self.segmenter.segment(item, classes=self.card.classes))
 
-    def _over(self, name: str, images: Mapping[str, AerialImage], check: _Rule) -> Check:
-        """Run a check over images; the first fault counts."""
-        if not images:
-            return Check(name=name, outcome="not applicable", found=_NO_IMAGE)
-        fault = next(filter(None, (check(shown, image) for shown, image in images.items())), None)
-        return check_of(name, fault, counted(len(images), "image"))
+    def fault(self, label: str, item: AerialImage, reply: SegmenterReply) -> str | None:
+        del item
+        return None if reply.found is not None else f"{label}: {reply.status}: {reply.message}"
 
-    def _answers(self) -> Check:
-        """Ask about every image twice in a row, and keep the answers; report an unsound first answer once."""
-        faults = []
-        for name, image in self.images.items():
-            self.first[name] = self._ask(image)
-            fault = _fault(name, self.first[name])
-            if fault is None:
-                self.second[name] = self._ask(image)
-            else:
-                faults.append(fault)
-        shown = f"{faults[0]} ({len(faults)} of {counted(len(self.images), 'image')})" if faults else None
-        return check_of("shapes, known classes, and an unchanged picture", shown, self._told())
+    def is_same(self, first: Segmentation | None, other: Segmentation) -> bool:
+        return (
+            first is not None
+            and first.classes == other.classes
+            and np.array_equal(first.probability_bytes, other.probability_bytes)
+        )
 
     def _told(self) -> str:
-        told = [reply.segmentation for reply in self.first.values() if reply.segmentation is not None]
+        told = [reply.found for reply in self.first.values() if reply.found is not None]
         if not told:
             return "no answer"
         silent = np.mean([(each.probability_bytes == SILENT).mean() for each in told])
-        return f"{counted(len(told), 'image')}, {', '.join(told[0].classes)}; silent at {silent:.0%} of the pixels"
+        return f"{self.count(len(told))}, {', '.join(told[0].classes)}; silent at {silent:.0%} of the pixels"
 
-    def _twice(self, name: str, image: AerialImage) -> str | None:
-        del image
-        return _difference(name, self.first[name], self.second[name], "the second time")
-
-    def _classes(self, name: str, image: AerialImage) -> str | None:
-        del image
-        return self._other_classes(name, self.first[name])
-
-    def _other_classes(self, name: str, reply: SegmenterReply) -> str | None:
+    def _classes(self, label: str, reply: SegmenterReply) -> str | None:
         """Return a fault if an answer tells other classes than that about the first image."""
-        told = next(each.segmentation.classes for each in self.first.values() if each.segmentation is not None)
-        found = () if reply.segmentation is None else reply.segmentation.classes
-        return None if found == told else f"{name} tells {', '.join(found)}, the first one {', '.join(told)}"
+        told = next(each.found.classes for each in self.first.values() if each.found is not None)
+        found = () if reply.found is None else reply.found.classes
+        return None if found == told else f"{label} tells {', '.join(found)}, the first one {', '.join(told)}"
 
-    def _odd(self, name: str, image: AerialImage) -> str | None:
-        reply = self._ask(image)
-        return _fault(f"{name} ({image.shape[0]} x {image.shape[1]})", reply) or self._other_classes(name, reply)
-
-    def _order(self, images: Mapping[str, AerialImage]) -> Check:
-        """Check that an answer depends neither on earlier images nor on the start of the process."""
-        self.process.end()
-        again = {name: self._ask(images[name]) for name in reversed(list(images))}
-
-        def other(name: str, image: AerialImage) -> str | None:
-            del image
-            return _difference(name, self.first[name], again[name], "after others, in a fresh process")
-
-        return self._over("the same answers in any order", images, other)
-
-    def _cost(self) -> Check:
-        """Measure the second answers: the first ones may load libraries."""
-        name = "time and memory"
-        seconds = [reply.seconds for reply in self.second.values() if reply.seconds is not None]
-        if not seconds:
-            return Check(name=name, outcome="not applicable", found=_NO_IMAGE)
-        each_s = sum(seconds) / len(seconds)
-        found = f"{each_s:.3f} s an image, {self.process.peak_bytes / 1e6:.0f} MB at most"
-        return check_of(name, None if each_s < _QUICK_S else f"{found}: more than {_QUICK_S:g} s", found)
-
-
-def _fault(name: str, reply: SegmenterReply) -> str | None:
-    return None if reply.segmentation is not None else f"{name}: {reply.status}: {reply.message}"
-
-
-def _difference(name: str, first: SegmenterReply, other: SegmenterReply, when: str) -> str | None:
-    """Return how another answer about an image differs from the first; None if it does not."""
-    if other.segmentation is None:
-        return f"{name} has none ({other.status}: {other.message}) {when}"
-    return None if _is_same(first.segmentation, other.segmentation) else f"{name} has another answer {when}"
-
-
-def _is_same(first: Segmentation | None, other: Segmentation) -> bool:
-    return (
-        first is not None
-        and first.classes == other.classes
-        and np.array_equal(first.probability_bytes, other.probability_bytes)
-    )
+    def _odd(self, label: str, image: AerialImage) -> str | None:
+        reply = self.ask(image)
+        shown = f"{label} ({image.shape[0]} x {image.shape[1]})"
+        return self.fault(shown, image, reply) or self._classes(label, reply)

@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
 
 import numpy as np
 import psutil
@@ -19,6 +19,7 @@ import psutil
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.follower import Follower
 from sasgeo_bench.matching.matcher import (
+    MOST_LEARNED_BYTES,
     Learner,
     Match,
     Matcher,
@@ -45,12 +46,18 @@ MOST_MAPS: Final = 2  # cached while a matcher trains
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
-class PluginServer(ABC):
+Plugin = TypeVar("Plugin")
+
+
+class PluginServer(ABC, Generic[Plugin]):
     """Answers messages until the runner closes its end."""
+
+    most_learned_bytes = MOST_LEARNED_BYTES
 
     def __init__(self, channel: socket.socket, *, spec: str) -> None:
         self.channel = channel
         self.spec = spec
+        self._made: Plugin | None = None
 
     def run(self) -> None:
         """Serve until the other side closes."""
@@ -65,58 +72,60 @@ class PluginServer(ABC):
                 content, data = self._answers()[message["kind"]](blob, **fields)
                 answer = wire.packed({**head, "status": "ok", **content}, data)
             except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
-                answer = wire.packed({**head, **_failure(error, package=self._package())})
+                answer = wire.packed({**head, **_failure(error, package=_package_of(self._made))})
             try:
                 wire.put(self.channel, answer)
             except wire.Closed:  # the runner waited no longer
                 return
 
     @abstractmethod
+    def _make(self) -> Plugin:
+        """Import and make the plugin."""
+
+    @abstractmethod
     def _answers(self) -> Mapping[str, Callable[..., Answer]]:
         """Return what answers each kind of question, given the bytes after it and its fields."""
 
-    def _package(self) -> str:
-        """Return the package of the plugin; empty while it is not known."""
-        return ""
+    @property
+    def plugin(self) -> Plugin:
+        """Return the plugin, made at the first question."""
+        if self._made is None:
+            self._made = self._make()
+        return self._made
+
+    def _learned(self, learn: Callable[[], object]) -> Answer:
+        with (used := Clock()):
+            learned = learn()
+        return {"seconds": used.seconds}, check_learned(learned, most_bytes=self.most_learned_bytes).encode()
 
 
-class Server(PluginServer):
+class Server(PluginServer[Matcher | Tracker]):
     """Answers for a matcher, or a tracker."""
 
     def __init__(self, channel: socket.socket, *, spec: str) -> None:
         super().__init__(channel, spec=spec)
-        self._loaded: Matcher | Tracker | None = None
         self._grid: Grid | None = None
         self._follower: Tracker | None = None
 
-    def _package(self) -> str:
-        return package_of(self._loaded)
+    def _make(self) -> Matcher | Tracker:
+        return load_method(self.spec)
 
     def _answers(self) -> Mapping[str, Callable[..., Answer]]:
         return {"load": self._load, "learn": self._learn, "prepare": self._prepare, "match": self._match}
 
-    @property
-    def matcher(self) -> Matcher | Tracker:
-        """Return the plugin, loaded at the first question."""
-        if self._loaded is None:
-            self._loaded = load_method(self.spec)
-        return self._loaded
-
     def _load(self, _: bytes) -> Answer:
-        self._loaded = load_method(self.spec)
-        return {"card": asdict(self.matcher.card), "learns": isinstance(self.matcher, Learner)}, b""
+        return {"card": asdict(self.plugin.card), "learns": isinstance(self.plugin, Learner)}, b""
 
     def _learn(self, blob: bytes, *, regions: Mapping[str, str], query_bytes: Sequence[int]) -> Answer:
-        if not isinstance(self.matcher, Learner):
-            raise MatchError(f"{self.matcher.card.name} has no learn()")
+        learner = self.plugin
+        if not isinstance(learner, Learner):
+            raise MatchError(f"{learner.card.name} has no learn()")
         pairs = tuple(pairs_from(query_bytes, blob))
         maps = Maps({name: Path(folder) for name, folder in regions.items()})
-        start = time.perf_counter()
-        learned = check_learned(self.matcher.learn(Training(regions=maps, pairs=pairs)))
-        return {"seconds": time.perf_counter() - start, "learned": learned}, b""
+        return self._learned(lambda: learner.learn(Training(regions=maps, pairs=pairs)))
 
     def _prepare(self, _: bytes, *, region: str, learned: str | None) -> Answer:
-        reading, looking, matcher = _Cost(), _Cost(), self.matcher
+        reading, looking, matcher = _Cost(), _Cost(), self.plugin
         place = read_region(Path(region), around=lambda: reading, around_layer=lambda: looking, with_layers=False)
         self._grid = place.grid
         with (preparing := _Cost()):
@@ -126,15 +135,14 @@ class Server(PluginServer):
         return {"seconds": preparing.seconds - reading.seconds - looking.seconds, "grown_bytes": grown_bytes}, b""
 
     def _match(self, blob: bytes, *, top_k: int) -> Answer:
-        query, matcher = query_from(blob), self.matcher
+        query, matcher = query_from(blob), self.plugin
         if isinstance(matcher, Tracker):
             return _step(matcher, query, top_k), b""
         if query.step is not None and is_followed(matcher.card):
             return _step(self._following(matcher), query, top_k), b""
-        start, start_cpu = time.perf_counter(), time.process_time()
-        found = matcher.match(query, top_k=top_k)
-        seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
-        return {"seconds": seconds, "cpu_s": cpu_s, "match": match_row(check_match(found, query, top_k=top_k))}, b""
+        with (used := Clock()):
+            match = matcher.match(query, top_k=top_k)
+        return {**used.times(), "match": match_row(check_match(match, query, top_k=top_k))}, b""
 
     def _following(self, matcher: Matcher) -> Tracker:
         if self._follower is None:
@@ -146,15 +154,14 @@ def _step(tracker: Tracker, query: Query, top_k: int) -> wire.Message:
     """Answer the next view of a flight; its first one begins it."""
     if query.step is None:
         raise MatchError(f"{tracker.card.name} follows flights, and this query is a view alone")
-    start, start_cpu = time.perf_counter(), time.process_time()
-    if query.step.frame == 0:
-        tracker.start(query.prior)
-    found = tracker.step(query)
-    seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
+    with (used := Clock()):
+        if query.step.frame == 0:
+            tracker.start(query.prior)
+        found = tracker.step(query)
     fix = check_fix(found, top_k=top_k)
     covariance = None if fix.covariance is None else np.asarray(fix.covariance).ravel().tolist()
     row = {**match_row(match_of(fix)), "is_accepted": fix.is_accepted, "covariance": covariance}
-    return {"seconds": seconds, "cpu_s": cpu_s, "match": row}
+    return {**used.times(), "match": row}
 
 
 def _failure(error: Exception, *, package: str) -> wire.Message:
@@ -168,7 +175,7 @@ def _failure(error: Exception, *, package: str) -> wire.Message:
     return {"status": status, "message": one_line(message_of(error) + _last_line(error, package))}
 
 
-def package_of(plugin: object) -> str:
+def _package_of(plugin: object) -> str:
     """Return the package that the class of a plugin lies in; empty for None."""
     return "" if plugin is None else str(type(plugin).__module__).partition(".")[0]
 
@@ -183,18 +190,36 @@ def _last_line(error: Exception, package: str) -> str:
     return lines[-1] if lines else ""
 
 
-class _Cost:
-    """Seconds by the clock, and growth of the resident memory, while it is entered."""
+class Clock:
+    """Seconds by the clock, and of the processors, while it is entered."""
 
     def __init__(self) -> None:
-        self.seconds, self.grown_bytes = 0.0, 0
+        self.seconds, self.cpu_s = 0.0, 0.0
 
     def __enter__(self) -> Self:
-        self._before, self._start = _resident_bytes(), time.perf_counter()
+        self._start, self._start_cpu = time.perf_counter(), time.process_time()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.seconds += time.perf_counter() - self._start
+        self.cpu_s += time.process_time() - self._start_cpu
+
+    def times(self) -> wire.Message:
+        """Return both as part of an answer."""
+        return {"seconds": self.seconds, "cpu_s": self.cpu_s}
+
+
+class _Cost(Clock):
+    """The same, and growth of the resident memory."""
+
+    grown_bytes = 0
+
+    def __enter__(self) -> Self:
+        self._before = _resident_bytes()
+        return super().__enter__()
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
         self.grown_bytes += _resident_bytes() - self._before
 
 

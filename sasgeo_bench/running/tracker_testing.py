@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -15,44 +15,28 @@ from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import MATCHERS, TRACKERS
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.matcher import MatcherCard, is_followed, lacks
-from sasgeo_bench.progress import reporting, silent
-from sasgeo_bench.regions.build import build_region, plan_build
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.regions.region import Region
-from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.running.testing import Check, check_of, kept_check, listing_of, loaded_check, refusal_of
-from sasgeo_bench.running.worker import Limits, Reach, Reply, Worker
-from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.running.testing import Check, MapKit, TinyMap, check_of, draw, unseen
+from sasgeo_bench.running.worker import Limits, Reply
 from sasgeo_bench.tasks.query import Query, Step, Truth
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_files import query_bytes
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWN: Final = "town-riverside"  # the smallest over which views tell where they are
 _SUITE, _KIND = "flight-clean", "F1 vo-mono-survey"
 _ODD: Final = slice(5, 8)  # views that are changed: once a tracker may know its place, and some are left
 _NEAR_M: Final = 25.0
-_QUICK_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TinyFlights:
+class TinyFlights(TinyMap):
     """Short flights over a synthetic town, made by `tiny_flights`.
 
     `folder` holds regions/, tasks/ and truth/, as `make-queries` writes them. Each flight is its views in order, and
     `truths` gives the truth of a view by its query id.
     """
 
-    folder: Path
-    region: Region
     flights: tuple[tuple[Query, ...], ...]
     truths: dict[str, Truth]
-
-    @property
-    def map_folder(self) -> Path:
-        """Return the folder of the map."""
-        return self.folder / "regions" / self.region.manifest.id
 
 
 def tiny_flights(path: str | Path) -> TinyFlights:
@@ -67,30 +51,14 @@ def tiny_flights(path: str | Path) -> TinyFlights:
     >>> len(made.flights), made.flights[0][1].step.frame, made.flights[0][1].track
     (3, 1, 'sequence')
     """
-    folder = Path(path)
-    wanted = Wanted(
-        suites=(_SUITE,),
-        regions=(TOWN,),
-        split="crossfit",
-        count=1,
-        seed=1,
-        out=folder,
-        may_be_fewer=True,
-        choice=Choice(kinds=(_KIND,)),
+    region, pairs = draw(Path(path), TOWN, (_SUITE,), Choice(kinds=(_KIND,)))
+    truths = {query.query_id: truth for query, truth in pairs}
+    views = groupby((query for query, _ in pairs), key=lambda query: query.step and query.step.sequence_id)
+    flights = sorted(
+        (tuple(flight) for _, flight in views),
+        key=lambda flight: (truths[flight[0].query_id].kind != _KIND, flight[0].query_id),
     )
-    queries: list[Query] = []
-    truths: dict[str, Truth] = {}
-    with reporting(silent):
-        build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder))
-        for request in plan_requests(wanted):
-            for made in make_tasks(request):
-                queries += made.queries()
-                truths |= {truth.query_id: truth for truth in made.truths}
-    flights = [tuple(views) for _, views in groupby(queries, key=lambda query: query.step and query.step.sequence_id)]
-    flights.sort(key=lambda views: (truths[views[0].query_id].kind != _KIND, views[0].query_id))
-    return TinyFlights(
-        folder=folder, region=read_region(folder / "regions" / TOWN), flights=tuple(flights), truths=truths
-    )
+    return TinyFlights(folder=Path(path), region=region, flights=tuple(flights), truths=truths)
 
 
 def check_tracker(
@@ -104,61 +72,57 @@ def check_tracker(
     with ExitStack() as stack:
         if made is None:
             made = tiny_flights(stack.enter_context(scratch_folder("check")))
-        readable, hidden = made.map_folder.resolve(), (made.folder / "truth").resolve()
-        reach = Reach(readable=[readable], hidden=[hidden, (made.folder / "tasks").resolve()], is_shut_in=is_shut_in)
-        worker = stack.enter_context(Worker(spec=spec, reach=reach, limits=limits or Limits()))
-        before = listing_of(made.folder)
-        loaded = worker.load()
-        group = MATCHERS if loaded.card is not None and is_followed(loaded.card) else TRACKERS
-        yield (first := loaded_check(spec, loaded, loaded.card, group=group))
-        if loaded.card is None or first.outcome == "fail":
-            return
-        ready = worker.prepare(made.map_folder)
-        seconds = f"{ready.seconds:.2f} s" if ready.seconds is not None else ready.message
-        yield Check(name="prepares a map", outcome="pass" if ready.status == "ok" else "fail", found=seconds)
-        kit = _Kit(worker=worker, card=loaded.card, made=made)
-        if ready.status == "ok":
-            yield from kit.checks()
-        limited = worker.isolation.get("files_changed", "")
-        yield kept_check(kit.refused or refusal_of(ready), before, listing_of(made.folder), limited)
+        worker = stack.enter_context(made.worker(spec, limits=limits, is_shut_in=is_shut_in))
+        yield from _TrackerKit(process=worker, folder=made.folder, worker=worker, place=made).table()
 
 
 @dataclass(kw_only=True)
-class _Kit:
-    worker: Worker
-    card: MatcherCard
-    made: TinyFlights
-    refused: str = ""
+class _TrackerKit(MapKit[Query]):
+    one: ClassVar[str] = "a view"
+    many: ClassVar[str] = "views"
+    first_rule: ClassVar[str] = "follows a flight"
 
-    def checks(self) -> Iterator[Check]:
+    place: TinyFlights
+
+    def group_of(self, card: MatcherCard) -> str:
+        return MATCHERS if is_followed(card) else TRACKERS
+
+    def rules(self) -> Iterator[Check]:
         """Run every check in turn; nothing more where an ordinary flight is not followed."""
-        views, other = (flight[:12] for flight in self.made.flights[:2])  # 12 views of a flight that are asked
+        views, other = (flight[:12] for flight in self.place.flights[:2])  # 12 views of a flight that are asked
         lack = lacks(self.card, views[0])
         if lack is not None:
-            yield Check(name="follows a flight", outcome="not applicable", found=f"the flights here have {lack}")
+            yield Check(name=self.first_rule, outcome="not applicable", found=f"the flights here have {lack}")
             return
         first = self._fly(views)
-        yield check_of("follows a flight", _fault(first, views), self._told(first))
+        yield check_of(self.first_rule, _fault(first, views), self._told(first))
         if _fault(first, views) is not None:
             return
         yield _covariances(first)
         yield self._again("the same answers twice", first, views)
         self._fly(other)
         yield self._again("forgets the flight before", first, views)
-        self.worker.end()
+        self.process.end()
         # 6 of them, where the flight is cut short
         yield self._again("the same answers to a flight that is cut short, in a fresh process", first, views[:6])
         for name, changed in odd_flights(views).items():
-            yield check_of(name, _fault(self._fly(changed), changed), counted(len(changed), "view"))
-        yield self._unseen(views)
-        yield self._cost(first)
+            yield check_of(name, _fault(self._fly(changed), changed), self.count(len(changed)))
+        yield self._blind([replace(query, evidence=unseen(query)) for query in views])
+        seconds = [reply.seconds or 0.0 for reply in first]
+        yield self.quick(seconds, f"{np.median(seconds):.3f} s a step (median), {max(seconds):.3f} s at most")
+
+    def ask(self, item: Query) -> Reply:
+        return self.noted(self.worker.match(query_bytes(item), top_k=10))
+
+    def fault(self, label: str, item: Query, reply: Reply) -> str | None:
+        del item
+        return None if reply.found is not None else f"{label}: {reply.status}: {reply.message}"
 
     def _fly(self, views: Sequence[Query]) -> list[Reply]:
         """Ask the views of a flight in order; stop at the first without an answer."""
-        replies = []
+        replies: list[Reply] = []
         for query in views:
-            replies.append(self.worker.match(query_bytes(query), top_k=10))
-            self.refused = self.refused or refusal_of(replies[-1])
+            replies.append(self.ask(query))
             if replies[-1].status != "ok":
                 break
         return replies
@@ -167,44 +131,33 @@ class _Kit:
         for frame, (before, now) in enumerate(zip(first, self._fly(views), strict=False)):
             if now.status != "ok":
                 return Check(name=name, outcome="fail", found=f"frame {frame}: {now.status}: {now.message}")
-            if (before.match, before.is_accepted, before.covariance) != (now.match, now.is_accepted, now.covariance):
+            if before.found != now.found:
                 return Check(name=name, outcome="fail", found=f"frame {frame} has another answer")
-        return Check(name=name, outcome="pass", found=counted(len(views), "view"))
+        return Check(name=name, outcome="pass", found=self.count(len(views)))
 
-    def _unseen(self, views: Sequence[Query]) -> Check:
+    def _blind(self, views: Sequence[Query]) -> Check:
         """Check that nothing is accepted where no view shows anything: the start is known to some 500 m alone."""
-        blind = [replace(query, evidence=_unknown(query)) for query in views]
-        replies = self._fly(blind)
-        accepted = sum(bool(reply.is_accepted) for reply in replies)
-        fault = f"{accepted} of {counted(len(blind), 'view')} accepted: odometry alone does not tell the place"
-        return check_of(
-            "accepts nothing where nothing is seen",
-            _fault(replies, blind) or (fault if accepted else None),
-            counted(len(blind), "view"),
-        )
+        replies, number = self._fly(views), self.count(len(views))
+        accepted = sum(bool(reply.found and reply.found.is_accepted) for reply in replies)
+        fault = f"{accepted} of {number} accepted: odometry alone does not tell the place" if accepted else None
+        return check_of("accepts nothing where nothing is seen", _fault(replies, views) or fault, number)
 
     def _told(self, replies: Sequence[Reply]) -> str:
         """Describe how near the estimates are, and how many were accepted."""
         near, accepted, wrong = 0, 0, 0
-        for query, reply in zip(self.made.flights[0], replies, strict=False):
-            truth, poses = self.made.truths[query.query_id].pose, reply.match.poses if reply.match else ()
+        for query, reply in zip(self.place.flights[0], replies, strict=False):
+            if reply.found is None:
+                continue
+            truth, fix = self.place.truths[query.query_id].pose, next(iter(reply.found.candidates), None)
             is_near = bool(
                 truth
-                and poses
-                and np.hypot(poses[0].easting_m - truth.easting_m, poses[0].northing_m - truth.northing_m) <= _NEAR_M
+                and fix
+                and np.hypot(fix[0].easting_m - truth.easting_m, fix[0].northing_m - truth.northing_m) <= _NEAR_M
             )
-            near, accepted = near + is_near, accepted + bool(reply.is_accepted)
-            wrong += bool(reply.is_accepted) and not is_near
-        views = counted(len(replies), "view")
+            near, accepted = near + is_near, accepted + bool(reply.found.is_accepted)
+            wrong += bool(reply.found.is_accepted) and not is_near
+        views = self.count(len(replies))
         return f"{views}: {near} within {_NEAR_M:g} m, {accepted} accepted, {wrong} of these farther away"
-
-    def _cost(self, replies: Sequence[Reply]) -> Check:
-        seconds = [reply.seconds or 0.0 for reply in replies]
-        found = (
-            f"{np.median(seconds):.3f} s a step (median), {max(seconds):.3f} s at most, "
-            f"{self.worker.peak_bytes / 1e6:.0f} MB at most"
-        )
-        return check_of("time and memory", None if np.mean(seconds) < _QUICK_S else f"{found}: too slow", found)
 
 
 def odd_flights(views: Sequence[Query]) -> dict[str, tuple[Query, ...]]:
@@ -215,7 +168,7 @@ def odd_flights(views: Sequence[Query]) -> dict[str, tuple[Query, ...]]:
     # 5000 m: flown in one step, off the map
     return {
         "bears views that show nothing": tuple(
-            replace(query, evidence=_unknown(query)) if at in chosen else query for at, query in enumerate(views)
+            replace(query, evidence=unseen(query)) if at in chosen else query for at, query in enumerate(views)
         ),
         "bears steps that the odometer lost": tuple(
             replace(query, step=_stepped(query, None)) if at in chosen else query for at, query in enumerate(views)
@@ -231,11 +184,6 @@ def odd_flights(views: Sequence[Query]) -> dict[str, tuple[Query, ...]]:
         "bears a prior without a place": (replace(views[0], prior=nowhere), *views[1:]),
         "bears a flight of one view": tuple(views[:1]),
     }
-
-
-def _unknown(query: Query) -> Evidence:
-    """Return the evidence of a view without anything that is seen."""
-    return query.evidence.replace(np.full_like(query.evidence.cells, UNKNOWN))
 
 
 def _stepped(query: Query, increment: tuple[float, float, float] | None, *, sigma: float = 1.0) -> Step:
@@ -255,8 +203,8 @@ def _fault(replies: Sequence[Reply], views: Sequence[Query]) -> str | None:
 def _covariances(replies: Sequence[Reply]) -> Check:
     """Check that every estimate has a covariance, or none has; the door has checked that each is one."""
     name = "a covariance for every estimate"
-    posed = [reply for reply in replies if reply.match is not None and reply.match.poses]
-    given = [reply for reply in posed if reply.covariance is not None]
+    posed = [reply.found for reply in replies if reply.found is not None and reply.found.candidates]
+    given = [found for found in posed if found.covariance is not None]
     if not given:
         return Check(name=name, outcome="not applicable", found="none is given: figures of honesty will be empty")
     fault = f"{len(posed) - len(given)} of {len(posed)} estimates have none" if len(given) < len(posed) else None

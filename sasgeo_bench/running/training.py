@@ -18,7 +18,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.running.failures import LOG, guard, our_failure
 from sasgeo_bench.running.plan import RunPlan, TrainingResult, reach_of, with_training_result
 from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
-from sasgeo_bench.running.worker import PluginReply, Reply, Worker
+from sasgeo_bench.running.worker import AnyCard, Found, PluginReply, Reply, Worker
 from sasgeo_bench.sensing.segmentation import Segmentation, tables_of
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.texts import one_line
@@ -71,7 +71,7 @@ def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
     return Reply(status="crash", message=our_failure(plan.run_folder / LOG, plan.card.name, error))
 
 
-def failed_training(reply: PluginReply) -> TrainingResult:
+def failed_training(reply: PluginReply[AnyCard, Found]) -> TrainingResult:
     """Return the result of a failed training, whose message all rows get."""
     if reply.status == "ok":
         return TrainingResult(status="invalid", message="while learning: no text in an answer")

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 MOST_BYTES: Final = 2**20  # of a message from a matcher's process, which is not trusted
-MOST_LEARN_BYTES: Final = 8 * 2**20  # of one with a learned text: JSON may write one byte of it as six
 _HEAD: Final = struct.Struct("!II")
 _LEAST_S: Final = 1e-3  # zero would make the socket non-blocking
 

@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import IO, Annotated, Any, ClassVar, Final, Generic, Literal, Self, TypeVar
 
 import psutil
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, Strict, TypeAdapter, ValidationError
 
 import sasgeo_bench.running.child
 from sasgeo_bench.config import shipped_dir
@@ -28,7 +28,14 @@ from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import import_paths
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.matcher import MOST_SAID, Match, MatcherCard, Need, Status, check_learned
+from sasgeo_bench.matching.matcher import (
+    MOST_LEARNED_BYTES,
+    MOST_SAID,
+    MatcherCard,
+    Prediction,
+    Status,
+    check_learned,
+)
 from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE
 from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.launch import PROGRAM
@@ -36,7 +43,7 @@ from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
 from sasgeo_bench.running.wire import Message
 from sasgeo_bench.sensing.image import LABELLED
-from sasgeo_bench.tasks.query import Track, Truth
+from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_files import pairs_bytes
 from sasgeo_bench.texts import (
     BOUNDS,
@@ -52,12 +59,18 @@ from sasgeo_bench.texts import (
 _MOST_BYTES: Final = 2**50  # of memory
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PluginReply:
-    """Reply of any plugin to a question, with its status, and its cause in one line.
+AnyCard = TypeVar("AnyCard")
+Found = TypeVar("Found")
+Checked = TypeVar("Checked")
 
-    `seconds` is by the runner's clock, `own_s` and `cpu_s` are those that the process reports. Loading returns whether
-    the plugin `learns`; training, the `learned` text.
+
+@dataclass(frozen=True, kw_only=True)
+class PluginReply(Generic[AnyCard, Found]):
+    """Reply of a plugin to a question, with its status, and its cause in one line.
+
+    `seconds` is by the runner's clock, `own_s` and `cpu_s` are those that the process reports. Loading returns its
+    `card`, and whether the plugin `learns`; training, the `learned` text; preparing, by how much memory grew; a query
+    or an image, what was `found`.
     """
 
     status: Status
@@ -65,22 +78,14 @@ class PluginReply:
     seconds: float | None = None
     own_s: float | None = None
     cpu_s: float = 0.0
+    card: AnyCard | None = None
     learns: bool = False
     learned: str | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reply(PluginReply):
-    """Reply of a matcher: loading returns its `card` too; preparing, by how much memory grew; a query, the `match`.
-
-    A tracker's says whether its estimate is accepted, and its covariance, 3 x 3 row by row.
-    """
-
-    match: Match | None = None
-    is_accepted: bool | None = None
-    covariance: tuple[float, ...] | None = None
-    card: MatcherCard | None = None
     grown_bytes: int | None = None
+    found: Found | None = None
+
+
+Reply = PluginReply[MatcherCard, Prediction]  # of a matcher or tracker; its prediction has no id yet
 
 
 def _line(text: str) -> str:
@@ -93,8 +98,6 @@ def _bounded(name: str) -> Any:  # noqa: ANN401 - a field of pydantic
     least, most = BOUNDS[name]
     return Field(ge=least, le=most)
 
-
-Model = TypeVar("Model", bound=BaseModel)
 
 Line = Annotated[str, AfterValidator(_line)]
 Metres = Annotated[float, _bounded("easting_m")]
@@ -128,64 +131,9 @@ class Strictly(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class Failed(Strictly):
-    """A failure, and its cause."""
-
+class _Failed(Strictly):
     status: Literal["crash", "invalid", "refused"]
     message: Annotated[Line, Field(max_length=MOST_MESSAGE)]
-
-
-class SentCard(Strictly):
-    """Fields of every plugin's card."""
-
-    name: Line
-    version: Line
-    title: Line
-    source: Line
-    ours: Line
-    licence: Line
-    limits: Line
-    trained_on: Annotated[list[Line], Field(max_length=1000)]
-
-    def fields(self) -> dict[str, Any]:
-        """Return the arguments of a card, which has tuples for lists."""
-        return {name: tuple(value) if isinstance(value, list) else value for name, value in self}
-
-
-class _Card(SentCard):
-    tracks: list[Track]
-    needs: list[Need]
-    uses: list[Line]
-    authors: list[Line]
-    contact: Line
-    code: Line
-
-
-class _Loaded(Strictly):
-    status: Literal["ok"]
-    card: _Card
-    learns: bool
-
-    def reply(self) -> Reply:
-        return Reply(status="ok", card=MatcherCard(**self.card.fields()), learns=self.learns)
-
-
-class _Trained(Strictly):
-    status: Literal["ok"]
-    seconds: Seconds
-    learned: str
-
-    def reply(self) -> Reply:
-        return Reply(status="ok", own_s=self.seconds, learned=check_learned(self.learned))
-
-
-class _Prepared(Strictly):
-    status: Literal["ok"]
-    seconds: Seconds
-    grown_bytes: Annotated[int, Field(ge=0, le=_MOST_BYTES)]
-
-    def reply(self) -> Reply:
-        return Reply(status="ok", own_s=self.seconds, grown_bytes=self.grown_bytes)
 
 
 class _Row(Strictly):
@@ -195,69 +143,56 @@ class _Row(Strictly):
     is_accepted: bool | None = None
     covariance: Annotated[list[Variance], Field(min_length=SIDE**2, max_length=SIDE**2)] | None = None
 
+    def prediction(self) -> Prediction:
+        return Prediction(
+            query_id="",
+            candidates=tuple(
+                (Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale), score)
+                for x, y, yaw, scale, score in self.candidates
+            ),
+            confidence=self.confidence,
+            diagnostics=dict(self.diagnostics),
+            is_accepted=self.is_accepted,
+            covariance=None if self.covariance is None else tuple(self.covariance),
+        )
 
-class _Matched(Strictly):
+
+class Sound(Strictly):
+    """A sound answer, with the fields of its question (`_FIELDS`)."""
+
     status: Literal["ok"]
-    seconds: Seconds
-    cpu_s: Annotated[float, Field(ge=0)]
-    match: _Row
-
-    def reply(self) -> Reply:
-        row = self.match
-        match = Match(
-            poses=[Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in row.candidates],
-            scores=[candidate[-1] for candidate in row.candidates],
-            confidence=row.confidence,
-            diagnostics=dict(row.diagnostics),
-        )
-        return Reply(
-            status="ok",
-            own_s=self.seconds,
-            cpu_s=self.cpu_s,
-            match=match,
-            is_accepted=row.is_accepted,
-            covariance=None if row.covariance is None else tuple(row.covariance),
-        )
+    card: dict[str, JsonValue] | None = None
+    learns: bool = False
+    seconds: Seconds | None = None
+    cpu_s: Annotated[float, Field(ge=0)] = 0.0
+    grown_bytes: Annotated[int, Field(ge=0, le=_MOST_BYTES)] | None = None
+    match: _Row | None = None
 
 
-_KINDS: Final[Mapping[str, type[_Loaded | _Trained | _Prepared | _Matched]]] = {
-    "load": _Loaded,
-    "learn": _Trained,
-    "prepare": _Prepared,
-    "match": _Matched,
+# What the answer to each kind of question holds. The bytes after it are a learned text, or a segmentation.
+_FIELDS: Final[Mapping[str, frozenset[str]]] = {
+    "load": frozenset({"card", "learns"}),
+    "learn": frozenset({"seconds"}),
+    "prepare": frozenset({"seconds", "grown_bytes"}),
+    "match": frozenset({"seconds", "cpu_s", "match"}),
+    "segment": frozenset({"seconds", "cpu_s"}),
 }
 
 
-def read_reply(kind: str, given: Message, *, nonce: str) -> Reply:
-    """Read a JSON message as the reply to a question of a kind: "load", "learn", "prepare" or "match".
-
-    `nonce` is that of the question, so that no answer can be made before it. Raise `MatchError`, in one line, if the
-    message is no answer to the question.
-
-    >>> given = {"nonce": "7", "status": "crash", "message": "ValueError: no index today"}
-    >>> read_reply("match", given, nonce="7").message
-    'ValueError: no index today'
-    """
-    answer = read_answer(_KINDS[kind], given, nonce=nonce)
-    return Reply(status=answer.status, message=answer.message) if isinstance(answer, Failed) else answer.reply()
-
-
-def read_answer(model: type[Model], given: Message, *, nonce: str) -> Model | Failed:
-    """Read a JSON message as an answer of a model, or as a failure.
-
-    Raise `MatchError`, in one line, if it was made for another question or is neither.
-    """
-    content = dict(given)
-    if content.pop("nonce", None) != nonce:
-        raise MatchError("it was not made for this question")
+def checked(kind: TypeAdapter[Checked], given: object) -> Checked:
+    """Return what a process sent, as its type; raise `MatchError`, in one line, if it is none."""
     try:
-        return Failed.model_validate(content) if content.get("status") != "ok" else model.model_validate(content)
+        return kind.validate_python(given)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, first["loc"]))[:60]  # characters of where a fault is
-        raise MatchError(one_line(f"{where}: {first['msg']}" if where else first["msg"])) from error
+        fault = first["msg"].removeprefix("Value error, ")
+        raise MatchError(one_line(f"{where}: {fault}" if where else fault)) from error
 
 
+_FAILED: Final = TypeAdapter(_Failed)
+_SOUND: Final = TypeAdapter(Sound)
+_CARD: Final = TypeAdapter(MatcherCard)
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
 _KEPT_BYTES: Final = 4000  # of a matcher's output
 _START_S: Final = 120.0
@@ -291,18 +226,16 @@ class Reach:
     is_shut_in: bool = True
 
 
-AnyReply = TypeVar("AnyReply", bound=PluginReply)
-
-
 @dataclass(kw_only=True)
-class PluginProcess(ABC, Generic[AnyReply]):
+class PluginProcess(ABC, Generic[AnyCard, Found]):
     """The process of a plugin; a new one is started whenever the last one has ended.
 
     Use it in a `with` block: at its end no process or file of it is left. Each kind of plugin has a class of its own,
-    which names its `door` and asks its questions.
+    which names its `door`, asks its questions and reads what is its own in the answers.
     """
 
     door: ClassVar[str]
+    most_learned_bytes: ClassVar[int]
 
     spec: str
     reach: Reach
@@ -328,20 +261,56 @@ class PluginProcess(ABC, Generic[AnyReply]):
         self.end()
 
     @abstractmethod
-    def _failure(self, status: Status, message: str) -> AnyReply:
-        """Return the reply of a process that gave none."""
+    def _card(self, given: Mapping[str, JsonValue]) -> AnyCard:
+        """Read a card; raise `MatchError` if it is none."""
 
     @abstractmethod
-    def _read(self, kind: str, answer: wire.Message, data: bytes, *, nonce: str) -> AnyReply:
-        """Read an answer, and the bytes after it, to a question of a kind; raise `MatchError` if it is none."""
+    def _found(self, answer: Sound, data: bytes) -> Found | None:
+        """Read what was found for a query or an image, and the bytes after it; raise `MatchError` if it is none."""
+
+    def _read(self, kind: str, given: Message, data: bytes, *, nonce: str) -> PluginReply[AnyCard, Found]:
+        """Read an answer to a question of a kind, and its bytes; raise `MatchError`, in one line, if it is none.
+
+        `nonce` is that of the question, so that no answer can be made before it.
+        """
+        content = dict(given)
+        if content.pop("nonce", None) != nonce:
+            raise MatchError("it was not made for this question")
+        if content.get("status") != "ok":
+            failed = checked(_FAILED, content)
+            return PluginReply(status=failed.status, message=failed.message)
+        answer = checked(_SOUND, content)
+        odd = answer.model_fields_set ^ _FIELDS[kind] ^ {"status"}
+        if odd:
+            raise MatchError(f"{min(odd)} is missing, or no part of an answer to {kind!r}")
+        return PluginReply(
+            status="ok",
+            own_s=answer.seconds,
+            cpu_s=answer.cpu_s,
+            card=None if answer.card is None else self._card(answer.card),
+            learns=answer.learns,
+            learned=self._learned_text(data) if kind == "learn" else None,
+            grown_bytes=answer.grown_bytes,
+            found=self._found(answer, data) if kind in {"match", "segment"} else None,
+        )
+
+    def _learned_text(self, data: bytes) -> str:
+        try:
+            return check_learned(data.decode(), most_bytes=self.most_learned_bytes)
+        except UnicodeDecodeError as error:
+            raise MatchError("the learned text is no UTF-8") from error
 
     def _luggage(self) -> bytes | None:
         """Return bytes that a process of this door gets at its start, None for none."""
         return None
 
-    def load(self) -> AnyReply:
+    def load(self) -> PluginReply[AnyCard, Found]:
         """Import the plugin."""
         return self._ask("load", timeout_s=self.limits.prepare_s)
+
+    def _learn(self, blob: bytes = b"", **asked_for: wire.Json) -> PluginReply[AnyCard, Found]:
+        most_bytes = self.most_learned_bytes + wire.MOST_BYTES
+        return self._ask("learn", blob, timeout_s=self.limits.learn_s, most_bytes=most_bytes, **asked_for)
 
     def _is_gone(self) -> bool:
         return self._process is None or self._process.poll() is not None
@@ -354,7 +323,7 @@ class PluginProcess(ABC, Generic[AnyReply]):
         timeout_s: float,
         most_bytes: int = wire.MOST_BYTES,
         **asked_for: wire.Json,
-    ) -> AnyReply:
+    ) -> PluginReply[AnyCard, Found]:
         """Ask a question of a kind, with its fields and the bytes after it; the methods of a server answer it."""
         nonce = secrets.token_hex(16)  # so that no answer can be made in advance
         try:
@@ -367,17 +336,17 @@ class PluginProcess(ABC, Generic[AnyReply]):
             reply = self._read(kind, answer, data, nonce=nonce)
         except wire.Late as late:
             self.end()
-            return self._failure("timeout", str(late) or f"no answer within {timeout_s:g} s")
+            return PluginReply(status="timeout", message=str(late) or f"no answer within {timeout_s:g} s")
         except wire.TooLong as error:
             self.end()
-            return self._failure("crash", one_line(str(error)))
+            return PluginReply(status="crash", message=one_line(str(error)))
         except wire.Closed as closed:
             words = self._last_words(str(closed))
             self.end()
-            return self._failure("crash", words)
+            return PluginReply(status="crash", message=words)
         except (MatchError, wire.Garbled) as error:
             self.end()
-            return self._failure("invalid", one_line(f"an answer that is none: {error}"))
+            return PluginReply(status="invalid", message=one_line(f"an answer that is none: {error}"))
         if reply.status != "ok":
             return reply
         seconds = came - asked
@@ -508,10 +477,11 @@ class PluginProcess(ABC, Generic[AnyReply]):
 
 
 @dataclass(kw_only=True)
-class Worker(PluginProcess[Reply]):
+class Worker(PluginProcess[MatcherCard, Prediction]):
     """The process of a matcher."""
 
     door: ClassVar[str] = "matcher"
+    most_learned_bytes: ClassVar[int] = MOST_LEARNED_BYTES
 
     _region: Path | None = None
     _learned: str | None = None
@@ -520,14 +490,7 @@ class Worker(PluginProcess[Reply]):
         """Train on queries, each a row in Arrow's stream format, and their truths, with maps by name."""
         sizes, blob = pairs_bytes(pairs)
         maps = {name: str(path.resolve()) for name, path in regions.items()}
-        return self._ask(
-            "learn",
-            blob,
-            timeout_s=self.limits.learn_s,
-            most_bytes=wire.MOST_LEARN_BYTES,
-            regions=maps,
-            query_bytes=sizes,
-        )
+        return self._learn(blob, regions=maps, query_bytes=sizes)
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, given the learned text."""
@@ -547,7 +510,7 @@ class Worker(PluginProcess[Reply]):
         if self._process is not None and self._is_gone():
             words = self._last_words("ended between two questions")
             self.end()
-            return self._failure("crash", words)
+            return PluginReply(status="crash", message=words)
         if self._process is None and self._region is not None:
             again = self.prepare(self._region, self._learned)
             if again.status != "ok":
@@ -557,12 +520,12 @@ class Worker(PluginProcess[Reply]):
             self.end()
         return reply
 
-    def _failure(self, status: Status, message: str) -> Reply:
-        return Reply(status=status, message=message)
+    def _card(self, given: Mapping[str, JsonValue]) -> MatcherCard:
+        return checked(_CARD, given)
 
-    def _read(self, kind: str, answer: wire.Message, data: bytes, *, nonce: str) -> Reply:
+    def _found(self, answer: Sound, data: bytes) -> Prediction | None:
         del data  # no answer of a matcher has any
-        return read_reply(kind, answer, nonce=nonce)
+        return None if answer.match is None else answer.match.prediction()
 
 
 def _signal_name(number: int) -> str:

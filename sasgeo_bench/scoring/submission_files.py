@@ -20,8 +20,9 @@ from sasgeo_bench.files.folders import check_known, file_record, fresh_folder, i
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.matcher import Match, Prediction, check_match
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, AnsweredTask, Submission, SubmittedFile
+from sasgeo_bench.matching.tracker import check_prediction
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import (
@@ -491,19 +492,13 @@ def _row_faults(
 def _answer_faults(file: str, row: int, item: Mapping[str, Any], query: _Asked | None) -> Iterator[Violation]:
     """Yield the faults of the answer itself; without its query, its place and candidates are not checked."""
     try:
-        prediction = prediction_of(item)
-        match = Match(
-            poses=[pose for pose, _ in prediction.candidates],
-            scores=[score for _, score in prediction.candidates],
-            confidence=prediction.confidence,
-            diagnostics=prediction.diagnostics,
-        )
-        check_match(match, None if query is None else query.head, top_k=MOST_CANDIDATES)
+        head = None if query is None else query.head
+        found = check_prediction(prediction_of(item), head, top_k=MOST_CANDIDATES)
         if query is not None:
-            _check_inside(match.poses, query)
+            _check_inside([pose for pose, _ in found.candidates], query)
     except MatchError as error:
-        found, _, expected = str(error).partition(", expected ")
-        yield Violation(file, row, "candidates", found, expected or "an answer")
+        fault, _, expected = str(error).partition(", expected ")
+        yield Violation(file, row, "candidates", fault, expected or "an answer")
 
 
 def _check_inside(poses: Sequence[Pose], query: _Asked) -> None:

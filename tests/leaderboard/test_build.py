@@ -128,11 +128,8 @@ def submission(out, path, *, keep=lambda _: True, change=lambda row, query: row)
     rows = []
     for town in TOWNS:
         truths = {truth.query_id: truth for truth in task_files.read_truths(out / "truth" / "clean" / town)}
-        for query in task_files.read_queries(out / "tasks" / "clean" / town):
-            match = right_answer(query, truths[query.query_id])
-            candidates = tuple(zip(match.poses, match.scores, strict=True))
-            row = Prediction(query_id=query.query_id, candidates=candidates, confidence=match.confidence)
-            rows.append(change(row, query))
+        queries = task_files.read_queries(out / "tasks" / "clean" / town)
+        rows += [change(right_answer(query, truths[query.query_id]), query) for query in queries]
     part = prediction_files.write_part(path.parent / "parts", [row for at, row in enumerate(rows) if keep(at)])
     shutil.move(part, path)
     return len(rows)

@@ -20,7 +20,6 @@ from sasgeo_bench.leaderboard.board_files import read_board_manifest, read_leade
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.leaderboard.scored import ScoreRequest
-from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import Card, example_card
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.archive import laid_tasks, pack_board
@@ -90,10 +89,8 @@ def right(stored):
     out, rows = stored.parent / "out", []
     for suite in SUITES:
         truths = {item.query_id: item for item in task_files.read_truths(out / "truth" / suite / "town-riverside")}
-        for query in task_files.read_queries(out / "tasks" / suite / "town-riverside"):
-            match = right_answer(query, truths[query.query_id])
-            candidates = tuple(zip(match.poses, match.scores, strict=True))
-            rows.append(Prediction(query_id=query.query_id, candidates=candidates, confidence=match.confidence))
+        queries = task_files.read_queries(out / "tasks" / suite / "town-riverside")
+        rows += [right_answer(query, truths[query.query_id]) for query in queries]
     return rows
 
 

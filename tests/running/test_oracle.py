@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.matching.matcher import check_match
+from sasgeo_bench.matching.tracker import check_prediction
 from sasgeo_bench.progress import Lines
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import right_answer
@@ -42,12 +42,12 @@ def test_an_absent_place_is_withheld_and_a_right_candidate_is_chosen(task, truth
     query = next(task_files.read_queries(task))
     truth = truths[query.query_id]
     absent = right_answer(query, replace(truth, is_present=False))
-    assert (list(absent.poses), absent.confidence) == ([], 0.0)
-    assert not right_answer(query, replace(truth, pose=None)).poses
+    assert (absent.candidates, absent.confidence) == ((), 0.0)
+    assert not right_answer(query, replace(truth, pose=None)).candidates
     near = [replace(truth.pose, easting_m=truth.pose.easting_m + off, yaw_deg=0.0) for off in (400.0, 3.0, -700.0)]
     choice = replace(query, track="retrieval", candidates=tuple(near))
-    found = check_match(right_answer(choice, replace(truth, candidate=1)), choice, top_k=1)
-    assert found.poses == [replace(truth.pose, easting_m=near[1].easting_m)]
+    found = check_prediction(right_answer(choice, replace(truth, candidate=1)), choice, top_k=1)
+    assert found.candidates == ((replace(truth.pose, easting_m=near[1].easting_m), 1.0),)
 
 
 def test_without_truths_the_control_says_what_it_needs(place, task, tmp_path):

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.matcher import Match, check_match
+from sasgeo_bench.matching.matcher import Match, Prediction, check_match
 from sasgeo_bench.running import wire
-from sasgeo_bench.running.worker import read_reply
+from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.query import Head
 from sasgeo_bench.texts import MOST_MESSAGE
 
@@ -32,7 +32,7 @@ CARD = {
 }
 SOUND = {
     "load": {"status": "ok", "card": CARD, "learns": False},
-    "learn": {"status": "ok", "seconds": 1.0, "learned": "text"},
+    "learn": {"status": "ok", "seconds": 1.0},
     "prepare": {"status": "ok", "seconds": 1.0, "grown_bytes": 5},
     "match": {
         "status": "ok",
@@ -55,7 +55,7 @@ def received(text, kind="match", nonce="7", length=None):
     with theirs, ours:
         threading.Thread(target=put, args=(theirs, (length or len(text)).to_bytes(4, "big") + bytes(4) + text)).start()
         said, _ = wire.receive(ours, deadline=time.monotonic() + 60, most_bytes=wire.MOST_BYTES)
-    return read_reply(kind, said, nonce=nonce)
+    return Worker(spec="", reach=Reach(readable=[], hidden=[]), limits=Limits())._read(kind, said, b"text", nonce=nonce)
 
 
 def sound(kind, **changes):
@@ -81,13 +81,28 @@ def test_a_sound_answer_is_read(kind):
     assert (failed.status, failed.message) == ("refused", "why")
 
 
+@pytest.mark.parametrize("data", [b"", b"\xff", b"x" * (2**20 + 1)])
+def test_a_learned_text_that_cannot_be_stored_is_one_line(data):
+    worker = Worker(spec="", reach=Reach(readable=[], hidden=[]), limits=Limits())
+    with pytest.raises(MatchError) as refused:
+        worker._read("learn", {"nonce": "7", "status": "ok", "seconds": 1.0}, data, nonce="7")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("change", [{"seconds": None, "learns": True}, {"cpu_s": 0.1, "grown_bytes": 1}])
+def test_an_answer_to_another_question_is_refused(kind, change):
+    with pytest.raises(MatchError, match="is missing, or no part of an answer to"):
+        received(sound(kind, **change), kind)
+
+
 def answer(candidates="[]", confidence="null", diagnostics="[]", seconds="0.1"):
     row = f'{{"candidates": {candidates}, "confidence": {confidence}, "diagnostics": {diagnostics}}}'
     return f'{{"nonce": "7", "status": "ok", "seconds": {seconds}, "cpu_s": 0.1, "match": {row}}}'
 
 
 def test_the_shape_of_an_answer_by_hand_is_that_of_a_sound_one():
-    assert received(answer().encode()).match == Match(poses=[], scores=[])
+    assert received(answer().encode()).found == Prediction(query_id="")
 
 
 @pytest.mark.parametrize(
@@ -137,6 +152,7 @@ def test_what_is_no_answer_is_one_line(text):
         *({**CARD, "name": value} for value in (None, "", "\ud800", "x" * 5000, "two\nlines")),
         *({**CARD, "tracks": value} for value in ("localization", [], ["other"])),
         *({**CARD, "trained_on": value} for value in ("munich", ["a"] * 1001)),
+        *({**CARD, "uses": value} for value in ("imagery", [1], {"a": "b"})),
     ],
     ids=lambda card: ascii(card)[-40:],
 )
@@ -200,9 +216,9 @@ def test_any_json_is_a_reply_or_one_line(case):
         return
     assert reply.status in {"ok", "crash", "invalid", "refused"}
     assert reply.message.isprintable()
-    for match in [reply.match] if reply.match is not None else []:
-        assert all(abs(pose.easting_m) <= 1e8 for pose in match.poses)
-        assert all(name.isprintable() for name in match.diagnostics)
+    for found in [reply.found] if reply.found is not None else []:
+        assert all(abs(pose.easting_m) <= 1e8 for pose, _ in found.candidates)
+        assert all(name.isprintable() for name in found.diagnostics)
 
 
 @given(st.binary(max_size=60))

@@ -318,14 +318,14 @@ def test_hostile_matchers_cost_their_own_rows_from_the_run_to_the_board(task, un
 
 
 def test_a_mistake_of_ours_about_one_answer_costs_its_row_and_the_log_says_where(task, tmp_path, monkeypatch):
-    work, count = answers.check_match, iter(range(100))
+    work, count = answers.check_prediction, iter(range(100))
 
     def broken(*words, **more):
         if next(count) == 1:
             raise KeyError("a mistake of ours")
         return work(*words, **more)
 
-    monkeypatch.setattr(answers, "check_match", broken)
+    monkeypatch.setattr(answers, "check_prediction", broken)
     report, folder = run_all(request_of(task, tmp_path, limit=3))
     assert report.counts == {"ok": 2, "crash": 1}
     assert report.messages == {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.running import sandbox, segmenter_testing
+from sasgeo_bench.running import sandbox, testing
 from sasgeo_bench.running.segmenter_testing import check_segmenter
 from sasgeo_bench.running.testing import LEARNS
 from sasgeo_bench.sensing.tiny_images import tiny_images
@@ -29,7 +29,7 @@ shut_in = pytest.mark.skipif(sandbox.landlock_version() == 0, reason="this kerne
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch):
     """A good segmenter is not too slow for the kit, however busy the machine is."""
-    monkeypatch.setattr(segmenter_testing, "_QUICK_S", 600.0)
+    monkeypatch.setattr(testing, "_QUICK_S", 600.0)
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
 
 
@@ -117,7 +117,7 @@ def test_one_that_needs_what_it_does_not_learn_is_asked_nothing(table) -> None:
 
 
 def test_a_segmenter_that_takes_too_long_fails_by_its_time_alone(table, monkeypatch) -> None:
-    monkeypatch.setattr(segmenter_testing, "_QUICK_S", 0.0)
+    monkeypatch.setattr(testing, "_QUICK_S", 0.0)
     assert failed(table("Good")) == ["time and memory"]
 
 

@@ -51,8 +51,8 @@ def test_images_are_answered_with_what_the_plugin_itself_would_say(request_of) -
     assert [reply.status for reply in replies] == ["ok", "ok"]
     for labelled, reply in zip(images, replies, strict=True):
         right = Good().segment(labelled.image, learned=None)
-        assert reply.segmentation.classes == right.classes
-        np.testing.assert_array_equal(reply.segmentation.probability_bytes, right.probability_bytes)
+        assert reply.found.classes == right.classes
+        np.testing.assert_array_equal(reply.found.probability_bytes, right.probability_bytes)
         assert 0 < reply.own_s <= reply.seconds
 
 
@@ -86,7 +86,7 @@ def test_whatever_a_segmenter_answers_becomes_a_status_and_a_line(request_of, na
     assert reply.status == status, reply.message
     assert re.search(words, reply.message), reply.message
     assert "\n" not in reply.message
-    assert reply.segmentation is None
+    assert reply.found is None
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_what_was_learned_goes_to_every_process_that_is_asked(request_of, name) 
     assert taught.status == "ok"
     at = images[0].classes.index("building")
     is_roof, is_none = (images[0].labels[at] == label for label in (1, 0))
-    roof = taught.segmentation.probabilities()[0]
+    roof = taught.found.probabilities()[0]
     assert roof[is_roof].mean() > 0.5 > 2 * roof[is_none].mean()
     assert untaught.status == ("ok" if name == "Learns" else "not applicable")
     assert untaught.message == ("" if name == "Learns" else "no training")
@@ -160,9 +160,9 @@ def test_a_segmenter_sees_no_labels_of_what_it_is_asked(request_of, tmp_path) ->
     for folder in ("out/truth/images", "out/tasks/images", "mine/test"):
         write_labelled(tmp_path / folder, tiny_images())
     (reply,) = told(request_of("LooksForLabels"), tiny_images()[0])
-    assert int(reply.segmentation.probability_bytes.max()) == 0
+    assert int(reply.found.probability_bytes.max()) == 0
     (reply,) = told(request_of("LooksForLabels", is_shut_in=False), tiny_images()[0])
-    assert int(reply.segmentation.probability_bytes.min()) == 12
+    assert int(reply.found.probability_bytes.min()) == 12
 
 
 @shut_in
@@ -193,7 +193,7 @@ def test_the_control_answers_with_the_labels_and_starts_no_process(request_of) -
     request = request_of("Good", spec=ORACLE_SEGMENTER)
     labelled = tiny_images()[0]
     with SegmenterRun(request, load_card(request)) as run:
-        found = run.segment(labelled).segmentation
+        found = run.segment(labelled).found
         assert run.isolation == {"truth": "given, as this control needs it"}
         with pytest.raises(MatchError, match="answers with labels, and this image has none"):
             run.segment(labelled.image)

@@ -9,7 +9,7 @@ import pytest
 
 from sasgeo_bench.matching.scaffold import package_files, write_plugin
 from sasgeo_bench.matching.tracker import check_fix
-from sasgeo_bench.running import tracker_testing
+from sasgeo_bench.running import testing
 from sasgeo_bench.running.tracker_testing import TinyFlights, check_tracker, odd_flights, tiny_flights
 
 ROWS = (
@@ -43,7 +43,7 @@ def made(tmp_path_factory) -> TinyFlights:
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch):
     """A good tracker is not too slow for the kit, however busy the machine is."""
-    monkeypatch.setattr(tracker_testing, "_QUICK_S", 600.0)
+    monkeypatch.setattr(testing, "_QUICK_S", 600.0)
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
 
 

@@ -120,7 +120,7 @@ def test_an_end_between_two_questions_costs_one_and_the_map_is_prepared_again(pl
         second, third = (worker.match(query, top_k=5) for _ in range(2))
     assert [reply.status for reply in (first, second, third)] == ["ok", "crash", "ok"]
     assert "died by SIGKILL" in second.message
-    assert third.match == first.match
+    assert third.found == first.found
 
 
 @shut_in
@@ -130,7 +130,7 @@ def test_the_truth_is_out_of_reach(place, task):
     (trusted,), _ = ask(place, task, "ReadsTruth", is_shut_in=False)
     assert "read the truth" in trusted.message  # it looks in the right place
     (listed,), _ = ask(place, task, "ListsFolders")
-    assert listed.match.diagnostics["truth files"] == 0
+    assert listed.found.diagnostics["truth files"] == 0
     assert worker.isolation["truth"] != "not protected"
 
 
@@ -179,10 +179,10 @@ def test_whatever_beside_the_code_tells_answers_is_out_of_reach(place, task, tmp
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     (reply,), worker = ask(place, task, "ReadsAllBeside")
-    assert reply.match.diagnostics == {"told": 1}, "the harmless one alone"
+    assert reply.found.diagnostics == {"told": 1}, "the harmless one alone"
     assert "not looked for" not in worker.isolation["truth"]
     (trusted,), _ = ask(place, task, "ReadsAllBeside", is_shut_in=False)
-    assert trusted.match.diagnostics["told"] > len(names) + 1
+    assert trusted.found.diagnostics["told"] > len(names) + 1
 
 
 @shut_in
@@ -194,7 +194,7 @@ def test_a_matcher_that_lies_among_stored_results_runs_and_does_not_read_them(pl
     monkeypatch.chdir(tmp_path)
     (reply,), worker = ask(place, task, "ReadsAllBeside")
     assert reply.message == ""
-    assert reply.match.diagnostics == {"told": 0}
+    assert reply.found.diagnostics == {"told": 0}
     assert worker.isolation["truth"] != "not protected"
 
 
@@ -215,9 +215,9 @@ def test_command_lines_of_others_are_out_of_reach(place, task):
             (trusted,), _ = ask(place, task, "ReadsCommandLines", is_shut_in=False)
         finally:
             other.kill()
-    assert reply.match.diagnostics["secrets"] == 0
-    assert reply.match.diagnostics["own"] > 0
-    assert trusted.match.diagnostics["secrets"] >= 1  # others on this machine may run this test at the same time
+    assert reply.found.diagnostics["secrets"] == 0
+    assert reply.found.diagnostics["own"] > 0
+    assert trusted.found.diagnostics["secrets"] >= 1  # others on this machine may run this test at the same time
     assert "can be read" not in worker.isolation["processes"]
 
 
@@ -245,8 +245,8 @@ def test_the_environment_says_nothing_of_where_it_runs(place, task, monkeypatch)
     monkeypatch.setenv("SASGEO_OUT", str(place))
     monkeypatch.setenv("MY_SECRET", "1")
     (reply,), _ = ask(place, task, "TellsEnvironment")
-    assert {"HOME", "PATH"} <= set(reply.match.diagnostics)
-    assert not {"SASGEO_OUT", "SASGEO_EXTRACTS", "MY_SECRET", "PYTHONPATH"} & set(reply.match.diagnostics)
+    assert {"HOME", "PATH"} <= set(reply.found.diagnostics)
+    assert not {"SASGEO_OUT", "SASGEO_EXTRACTS", "MY_SECRET", "PYTHONPATH"} & set(reply.found.diagnostics)
 
 
 @pytest.mark.parametrize("name", ["Forks", "Hangs", "Plain"])

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from sasgeo_bench.running import answers, plan, profiling, segmenter_testing, segmenting, testing, training
-from sasgeo_bench.running.segmenter_process import SegmenterProcess
+from sasgeo_bench.running.segmenting import SegmenterProcess
 from sasgeo_bench.running.serve import PluginServer, Server
 from sasgeo_bench.running.serve_segmenter import SegmenterServer
 from sasgeo_bench.running.worker import PluginProcess, Worker

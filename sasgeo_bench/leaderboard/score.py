@@ -31,7 +31,7 @@ from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.failures import Failures, log_beside, stops_all
-from sasgeo_bench.running.prediction_files import CardRecord, StoredAnswers
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding, with_causes
 from sasgeo_bench.scoring.contrasts import hold_contrasts
@@ -385,7 +385,7 @@ def _entry_of(entry: Entry, set_apart: str | None, on_private: OnPrivate, contro
         version=entry.version,
         hash=entry.hash,
         how=on_private.how(entry),
-        card=None if entry.card is None else CardRecord.model_validate(entry.card),
+        card=entry.card,
         trained_on=entry.declared,
         set_apart=set_apart,
         isolation=joined(run.isolation or {} for run in entry.runs) if entry.runs else None,

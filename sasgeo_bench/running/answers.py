@@ -318,7 +318,7 @@ class _Map:
                     is_warm = False
                 if ready is None:
                     result = self._plan.training_result
-                    region, text = self._writers[0].part.region, None if result is None else result.text
+                    region, text = self._writers[0].part.region, None if result is None else result.learned
                     ready = guarded(self._plan, partial(worker.prepare, region, text))
                     self._check_map(ready)
                     if ready.status != "ok":  # a map that is ready answers nothing yet
@@ -389,9 +389,7 @@ class _Map:
     def _failed_training(self) -> Reply | None:
         """Return the reply to every query after a failed training; starts no process."""
         result = self._plan.training_result
-        if result is None or result.text is not None:
-            return None
-        return Reply(status=result.status, message=result.message)
+        return result if result is not None and result.learned is None else None
 
     def _check_map(self, ready: Reply) -> None:
         """Refuse a map that was replaced meanwhile, or is damaged: the matcher is not at fault."""

@@ -10,19 +10,18 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
+from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.files.plugins import (
     MATCHERS,
     ORACLE,
     SEGMENTERS,
     TRACKERS,
-    check_card_name,
     list_entry_points,
     plugin_code,
 )
 from sasgeo_bench.matching.cards import TrainingRecord, learned_path, read_learned
 from sasgeo_bench.matching.follower import follower_record
-from sasgeo_bench.matching.matcher import SOUND, STATUSES, MatcherCard, Status, matcher_hash
+from sasgeo_bench.matching.matcher import SOUND, STATUSES, MatcherCard, matcher_hash
 from sasgeo_bench.progress import check_jobs
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import read_manifest
@@ -30,7 +29,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import CARD
 from sasgeo_bench.running.prediction_files import FollowerRecord, RunManifest
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training, root_of
-from sasgeo_bench.running.worker import Limits, Reach, Worker
+from sasgeo_bench.running.worker import Limits, Reach, Reply, Worker, loaded_card
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import Task, TaskManifest, asked_under, tie_key
@@ -140,20 +139,11 @@ class RunPart:
     key: str | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainingResult:
-    """Result of training: a text, or the status and one line of cause where there is none."""
-
-    text: str | None = None
-    status: Status = "ok"
-    message: str = ""
-
-
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
     """Plan of a run, made after the plugin's card was read in its own process.
 
-    `training_result` is None before training.
+    `training_result` is the reply to training, without a text where it failed, and None before.
     """
 
     request: RunRequest
@@ -162,7 +152,7 @@ class RunPlan:
     parts: tuple[RunPart, ...]
     learns: bool = False
     training_set: TrainingSet | None = None
-    training_result: TrainingResult | None = None
+    training_result: Reply | None = None
 
     @property
     def run_folder(self) -> Path:
@@ -185,7 +175,7 @@ class RunPlan:
         given, path = self.training_set, self.learned_file
         if given is None or path is None:
             return None
-        has_text = self.training_result is not None and self.training_result.text is not None
+        has_text = self.training_result is not None and self.training_result.learned is not None
         file = path.relative_to(self.run_folder).as_posix() if has_text else None
         key = _key(given, self.training_result)
         return TrainingRecord(key=key, file=file, trained_on=list(given.places), pairs=given.count)
@@ -250,7 +240,7 @@ def plan_run(request: RunRequest) -> RunPlan:
             lessons=request.lessons,
         )
         text = read_learned(learned_path(_run_folder(request, card, found), training_set.sha256))
-        result = None if text is None else TrainingResult(text=text)
+        result = None if text is None else Reply(status="ok", learned=text)
     key = None if training_set is None else _key(training_set, result)
     parts = tuple(_part(request, card, found, key, task) for task in tasks)
     return RunPlan(
@@ -281,7 +271,7 @@ def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
     return {name: value for name, value in asdict(limits).items() if name not in left_out}
 
 
-def with_training_result(plan: RunPlan, result: TrainingResult) -> RunPlan:
+def with_training_result(plan: RunPlan, result: Reply) -> RunPlan:
     """Return the plan with a training result: only answers given under it count as done. Raise as `plan_run` does."""
     plan = replace(plan, training_result=result)
     parts = tuple(_part(plan.request, plan.card, plan.hash, plan.key, part.task) for part in plan.parts)
@@ -292,8 +282,8 @@ def _run_folder(request: RunRequest, card: MatcherCard, found: str) -> Path:
     return request.out / "runs" / card.name / found
 
 
-def _key(training_set: TrainingSet, result: TrainingResult | None) -> str:
-    text = None if result is None else result.text
+def _key(training_set: TrainingSet, result: Reply | None) -> str:
+    text = None if result is None else result.learned
     hashed = f"nothing yet from {training_set.sha256}" if text is None else text
     return hashlib.sha256(hashed.encode()).hexdigest()
 
@@ -335,13 +325,9 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
     """Return a plugin's card and whether it learns, as its own process reports them, and the hash of its code."""
     if request.spec == ORACLE:
         return CARD, "", False
-    with Worker(spec=request.spec, reach=reach_of(request, ()), limits=request.limits) as worker:
-        reply = worker.load()
-    if reply.status != "ok" or reply.card is None:
-        cause = reply.message or "the plugin has no card"
-        raise MatchError(cause if request.spec in cause else f"{request.spec}: cannot be made ({cause})")
-    check_card_name(request.spec, reply.card.name, is_oracle=request.is_oracle)
-    return reply.card, matcher_code(request.spec), reply.learns
+    worker = Worker(spec=request.spec, reach=reach_of(request, ()), limits=request.limits)
+    card, learns = loaded_card(worker, group=MATCHERS, is_oracle=request.is_oracle)
+    return card, matcher_code(request.spec), learns
 
 
 def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:

@@ -175,7 +175,7 @@ def profile(
     with _pinned(request.cores) as cores:
         plan = trained(plan)
         result = plan.training_result
-        if result is not None and result.text is None:
+        if result is not None and result.learned is None:
             raise MatchError(f"{plan.card.name} learned nothing: {result.status}: {result.message}")
         asked, count = _asked(plan, request, is_pictured=manifest.imagery is not None)
         queries = counted(len(asked), "query", "queries") + (f", the first of {count}," if count > len(asked) else "")
@@ -185,7 +185,7 @@ def profile(
             begun = time.perf_counter()
             worker.load()
             start_s = time.perf_counter() - begun
-            ready = worker.prepare(region, None if result is None else result.text)
+            ready = worker.prepare(region, None if result is None else result.learned)
             if ready.status != "ok":
                 raise MatchError(f"{plan.card.name} cannot prepare {region.name}: {ready.status}: {ready.message}")
             first = worker.match(asked[0], top_k=request.top_k)
@@ -288,8 +288,7 @@ def _sustained(
     fixes: list[Fix] = []
     readings: list[Reading] = []
     begun, label, told = time.perf_counter(), f"{request.spec} profiled", 0
-    if progress is not None:
-        progress.begin(label, round(request.sustain_s))
+    progress.begin(label, round(request.sustain_s))
     for blob in cycle(asked):
         since_s = time.perf_counter() - begun
         if since_s >= request.sustain_s and len(fixes) >= LEAST_FIXES:
@@ -310,10 +309,9 @@ def _sustained(
         if len(fixes) == LEAST_FIXES and not any(fix.status == "ok" for fix in fixes):
             why = f"{reply.status}: {reply.message}" if reply.message else reply.status
             raise MatchError(f"{request.spec}: none of the first {LEAST_FIXES} fixes is an answer ({why})")
-        if progress is not None:
-            done = min(round(since_s + taken_s), round(request.sustain_s))
-            progress.advance(label, done - told)
-            told = done
+        done = min(round(since_s + taken_s), round(request.sustain_s))
+        progress.advance(label, done - told)
+        told = done
     readings.append(Reading(since_s=time.perf_counter() - begun, celsius=hottest_celsius(), mhz=clock_mhz()))
     return fixes, readings
 

@@ -220,14 +220,14 @@ def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group) -> st
     if kept is not None:
         return _kept_text(kept)
     result = train_segmenter(wanted.request, _lessons_of(chosen))
-    if result.text is None:
+    if result.learned is None:
         raise StoreError(
             f"{loaded.card.name} could not learn from {chosen.to_text()}: {result.message} ({result.status})"
         )
-    path = folder / f"{chosen.sha256}-{_digest(result.text)}.txt"
-    write_learned(path, result.text)
+    path = folder / f"{chosen.sha256}-{_digest(result.learned)}.txt"
+    write_learned(path, result.learned)
     tell(f"{loaded.card.name}: trained on the pictures of {chosen.to_text()}, {path}")
-    return result.text
+    return result.learned
 
 
 def _digest(text: str) -> str:

@@ -1,26 +1,111 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train a segmenter and ask it about images, in processes of its own; a failure costs one image and is recorded."""
 
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import ClassVar, Final, Self
 
-from sasgeo_bench.errors import MatchError
+import numpy as np
+from pydantic import JsonValue, TypeAdapter
+
+from sasgeo_bench.errors import ImageError, MatchError
 from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import ORACLE_SEGMENTER, SEGMENTERS, check_card_name
-from sasgeo_bench.matching.segmenter import SegmenterCard
+from sasgeo_bench.files.plugins import ORACLE_SEGMENTER, SEGMENTERS
+from sasgeo_bench.matching.segmenter import MOST_TEXT_BYTES, SegmenterCard, check_segmentation
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.running import wire
 from sasgeo_bench.running.answers import Patience
 from sasgeo_bench.running.failures import LOG, guard, our_failure
-from sasgeo_bench.running.oracle import ISOLATION, SEGMENTER_CARD, oracle_reply
-from sasgeo_bench.running.plan import TrainingResult, hidden_below, segmenter_code
-from sasgeo_bench.running.segmenter_process import SegmenterProcess, SegmenterReply
+from sasgeo_bench.running.oracle import ISOLATION
+from sasgeo_bench.running.plan import hidden_below, segmenter_code
 from sasgeo_bench.running.training import failed_training
-from sasgeo_bench.running.worker import Limits, Reach
-from sasgeo_bench.sensing.image import AerialImage, LabelledFiles, LabelledImage, write_labelled
+from sasgeo_bench.running.worker import Limits, PluginProcess, PluginReply, Reach, Sound, checked, loaded_card
+from sasgeo_bench.sensing.image import AerialImage, LabelledFiles, LabelledImage, image_bytes, write_labelled
+from sasgeo_bench.sensing.segmentation import CERTAIN, MOST_CLASSES, SILENT, Segmentation
+
+SegmenterReply = PluginReply[SegmenterCard, Segmentation]
+_CARD: Final = TypeAdapter(SegmenterCard)
+
+
+@dataclass(kw_only=True)
+class SegmenterProcess(PluginProcess[SegmenterCard, Segmentation]):
+    """The process of a segmenter; `learned` is the text that it gets with each image, None without training."""
+
+    door: ClassVar[str] = "segmenter"
+    most_learned_bytes: ClassVar[int] = MOST_TEXT_BYTES
+
+    learned: str | None = None
+    _asked: tuple[AerialImage, tuple[str, ...]] | None = None
+
+    def learn(self, images: Sequence[Path]) -> SegmenterReply:
+        """Train on the labelled images of some files, which the process must be able to read."""
+        return self._learn(images=[str(path.resolve()) for path in images])
+
+    def segment(self, image: AerialImage, *, classes: Sequence[str] = ()) -> SegmenterReply:
+        """Ask about one image; `classes` are those of the card, against which the answer is checked once more."""
+        self._asked = (image, tuple(classes))
+        rows, cols = image.shape
+        # 1.01: growth of bytes that do not become fewer by compression
+        most_bytes = int(MOST_CLASSES * rows * cols * 1.01) + wire.MOST_BYTES
+        return self._ask("segment", image_bytes(image), timeout_s=self.limits.match_s, most_bytes=most_bytes)
+
+    def _luggage(self) -> bytes | None:
+        return None if self.learned is None else self.learned.encode()
+
+    def _card(self, given: Mapping[str, JsonValue]) -> SegmenterCard:
+        return checked(_CARD, given)
+
+    def _found(self, answer: Sound, data: bytes) -> Segmentation:
+        """Return the segmentation that the bytes are, of the image that was asked about."""
+        del answer
+        if self._asked is None:
+            raise MatchError("nobody asked about an image")
+        image, classes = self._asked
+        try:
+            segmentation = Segmentation.from_bytes(data, shape=image.shape)
+        except ImageError as error:
+            raise MatchError(str(error)) from error
+        return check_segmentation(segmentation, image, classes=classes)
+
+
+SEGMENTER_CARD: Final = SegmenterCard(
+    name=ORACLE_SEGMENTER,
+    version="1",
+    title="Control: the labels themselves",
+    source="original",
+    ours="all of it",
+    licence="Apache-2.0",
+    limits="is no method: it reads the labels, so that whatever does not score it as perfect is at fault",
+)
+
+_BYTES: Final = np.zeros(3, dtype=np.uint8)  # of a label: absent is 0
+_BYTES[PRESENT], _BYTES[UNKNOWN] = CERTAIN, SILENT
+
+
+def right_segmentation(labelled: LabelledImage) -> Segmentation:
+    """Return the labels of an image as a segmentation: certain, and silent where nobody has looked.
+
+    >>> from sasgeo_bench.sensing.tiny_images import tiny_images
+    >>> first = tiny_images()[0]
+    >>> np.unique(right_segmentation(first).probability_bytes).tolist(), np.unique(first.labels).tolist()
+    ([0, 254, 255], [0, 1, 2])
+    """
+    return Segmentation(classes=labelled.classes, probability_bytes=_BYTES[labelled.labels])
+
+
+def oracle_reply(image: AerialImage | LabelledImage) -> SegmenterReply:
+    """Return the reply of the control; raise `MatchError` if an image has no labels."""
+    if not isinstance(image, LabelledImage):
+        raise MatchError(f"{ORACLE_SEGMENTER} answers with labels, and this image has none: name images with labels")
+    start = time.perf_counter()
+    found = right_segmentation(image)
+    seconds = time.perf_counter() - start
+    return SegmenterReply(status="ok", seconds=seconds, own_s=seconds, found=found)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,19 +157,15 @@ def load_card(request: SegmentRequest) -> LoadedSegmenter:
     """Load a segmenter in a process of its own; raise `MatchError` if that fails, or its name is not its own."""
     if request.spec == ORACLE_SEGMENTER:
         return LoadedSegmenter(card=SEGMENTER_CARD, code="", learns=False)
-    with SegmenterProcess(spec=request.spec, reach=request.reach(), limits=request.limits) as process:
-        reply = process.load()
-    if reply.status != "ok" or reply.card is None:
-        cause = reply.message or "the plugin has no card"
-        raise MatchError(cause if request.spec in cause else f"{request.spec}: cannot be made ({cause})")
-    check_card_name(request.spec, reply.card.name, group=SEGMENTERS)
-    return LoadedSegmenter(card=reply.card, code=segmenter_code(request.spec), learns=reply.learns)
+    process = SegmenterProcess(spec=request.spec, reach=request.reach(), limits=request.limits)
+    card, learns = loaded_card(process, group=SEGMENTERS)
+    return LoadedSegmenter(card=card, code=segmenter_code(request.spec), learns=learns)
 
 
-def train_segmenter(request: SegmentRequest, images: Iterable[LabelledImage]) -> TrainingResult:
+def train_segmenter(request: SegmentRequest, images: Iterable[LabelledImage]) -> SegmenterReply:
     """Train a segmenter on labelled images, in a process of its own that can read them and nothing else of ours.
 
-    `LabelledFiles` are read where they lie, others are written to a temporary folder first. A failure is a result
+    `LabelledFiles` are read where they lie, others are written to a temporary folder first. A failure is a reply
     without a text, and with its cause in a line. Raise `ImageError` if the images do not label the same classes,
     `StoreError` if they cannot be written.
     """
@@ -92,9 +173,7 @@ def train_segmenter(request: SegmentRequest, images: Iterable[LabelledImage]) ->
         reach = request.reach(tuple(dict.fromkeys(path.parent for path in paths)))
         with SegmenterProcess(spec=request.spec, reach=reach, limits=request.limits) as process:
             reply = guard(partial(process.learn, paths), partial(_failed_by_us, request))
-    if reply.status != "ok" or reply.learned is None:
-        return failed_training(reply)
-    return TrainingResult(text=reply.learned)
+    return reply if reply.learned is not None else failed_training(reply)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.running.failures import LOG, guard, our_failure
-from sasgeo_bench.running.plan import RunPlan, TrainingResult, reach_of, with_training_result
+from sasgeo_bench.running.plan import RunPlan, reach_of, with_training_result
 from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
 from sasgeo_bench.running.worker import AnyCard, Found, PluginReply, Reply, Worker
 from sasgeo_bench.sensing.segmentation import Segmentation, tables_of
@@ -49,7 +49,7 @@ def trained(plan: RunPlan) -> RunPlan:
             write_learned(path, reply.learned)
             text = reply.learned
             tell(f"{plan.card.name}: trained on {given.to_text()} in {reply.seconds or 0.0:.1f} s, {path}")
-    return with_training_result(plan, TrainingResult(text=text))
+    return with_training_result(plan, Reply(status="ok", learned=text))
 
 
 def _learn(plan: RunPlan, training_set: TrainingSet) -> Reply:
@@ -71,11 +71,11 @@ def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
     return Reply(status="crash", message=our_failure(plan.run_folder / LOG, plan.card.name, error))
 
 
-def failed_training(reply: PluginReply[AnyCard, Found]) -> TrainingResult:
-    """Return the result of a failed training, whose message all rows get."""
+def failed_training(reply: PluginReply[AnyCard, Found]) -> PluginReply[AnyCard, Found]:
+    """Return the reply to a failed training, whose message all rows get."""
     if reply.status == "ok":
-        return TrainingResult(status="invalid", message="while learning: no text in an answer")
-    return TrainingResult(status=reply.status, message=one_line(f"while learning: {reply.message}"))
+        return PluginReply(status="invalid", message="while learning: no text in an answer")
+    return PluginReply(status=reply.status, message=one_line(f"while learning: {reply.message}"))
 
 
 Said = tuple[Query, Sequence[Segmentation | None]]  # a query and the segmentations of its frames, None where it failed

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Annotated, Any, ClassVar, Final, Generic, Literal, Self, TypeVar
+from typing import IO, Annotated, Any, ClassVar, Final, Generic, Literal, Protocol, Self, TypeVar
 
 import psutil
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, Strict, TypeAdapter, ValidationError
@@ -26,7 +26,7 @@ import sasgeo_bench.running.child
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import import_paths
+from sasgeo_bench.files.plugins import check_card_name, import_paths
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import (
     MOST_LEARNED_BYTES,
@@ -59,7 +59,14 @@ from sasgeo_bench.texts import (
 _MOST_BYTES: Final = 2**50  # of memory
 
 
-AnyCard = TypeVar("AnyCard")
+class Named(Protocol):
+    """A card of any kind."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102 - as its fields say
+
+
+AnyCard = TypeVar("AnyCard", bound=Named)
 Found = TypeVar("Found")
 Checked = TypeVar("Checked")
 
@@ -526,6 +533,20 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
     def _found(self, answer: Sound, data: bytes) -> Prediction | None:
         del data  # no answer of a matcher has any
         return None if answer.match is None else answer.match.prediction()
+
+
+def loaded_card(process: PluginProcess[AnyCard, Found], *, group: str, is_oracle: bool = False) -> tuple[AnyCard, bool]:
+    """Load a plugin in a process of its own; return its card, and whether it learns.
+
+    Raise `MatchError` if that fails, or its name is not its own.
+    """
+    with process:
+        reply = process.load()
+    if reply.status != "ok" or reply.card is None:
+        cause = reply.message or "the plugin has no card"
+        raise MatchError(cause if process.spec in cause else f"{process.spec}: cannot be made ({cause})")
+    check_card_name(process.spec, reply.card.name, is_oracle=is_oracle, group=group)
+    return reply.card, reply.learns
 
 
 def _signal_name(number: int) -> str:

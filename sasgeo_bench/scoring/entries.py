@@ -2,7 +2,7 @@
 """Entries of a board: runs of matchers, files of predictions, and submissions."""
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,7 +19,7 @@ from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.progress import tell
 from sasgeo_bench.running.failures import Failures
-from sasgeo_bench.running.prediction_files import RUN, Answers, RunManifest, StoredAnswers, damaged
+from sasgeo_bench.running.prediction_files import RUN, Answers, CardRecord, RunManifest, StoredAnswers, damaged
 from sasgeo_bench.scoring.controls import Verdict, hold_controls, knows_too_much
 from sasgeo_bench.scoring.flights import score_flights
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, PACKED, RUN_HERE, is_unranked
@@ -52,11 +52,11 @@ class Entry:
     submission: Submission | None = None
 
     @property
-    def card(self) -> dict[str, Any] | None:
+    def card(self) -> CardRecord | None:
         """Return the card of the matcher or submission; None for a file of predictions."""
         if self.submission is not None:
-            return self.submission.card.model_dump(mode="json")
-        return self.runs[0].matcher.model_dump(mode="json", exclude_unset=True) if self.runs else None
+            return CardRecord.model_validate(self.submission.card.model_dump(mode="json"))
+        return self.runs[0].matcher if self.runs else None
 
     @property
     def declared(self) -> list[str] | None:
@@ -432,21 +432,12 @@ def _answers_of_file(
     return EntryAnswers(entry=entry, predictions=stored, held=held, asked=frozenset(task.folder for task in asked))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Shard:
-    """Answers of a run to a task: in memory, or, where there is no room, read again wherever they are used."""
-
-    source: Path
-    asked: Mapping[str, str]
-    is_tied: bool
-    kept: Answers | None = None
-
-    def open(self) -> Answers:
-        return Answers.open(self.source, self.asked, is_tied=self.is_tied) if self.kept is None else self.kept
+def _same(answers: Answers) -> Answers:
+    return answers
 
 
-def _merged(shards: Sequence[_Shard]) -> Answers:
-    return shards[0].open() if len(shards) == 1 else Answers.merged([shard.open() for shard in shards])
+def _merged(shards: Sequence[Callable[[], Answers]]) -> Answers:
+    return shards[0]() if len(shards) == 1 else Answers.merged([read() for read in shards])
 
 
 class _Room:
@@ -470,7 +461,7 @@ def _read_runs(
     Every answer is checked here; those that find no room are read again where they are used.
     """
     by_name = {task.manifest.name: task for task in tasks}
-    shards: dict[Path, list[_Shard]] = {}  # of a task: several as of shards of a run
+    shards: dict[Path, list[Callable[[], Answers]]] = {}  # of a task: several as of shards of a run
     runs: list[tuple[Path, RunManifest]] = []
     stale: list[Path] = []
     for source, run in zip(entry.sources, entry.runs, strict=True):
@@ -479,12 +470,12 @@ def _read_runs(
             stale.append(source)
             continue
         is_same = run.queries_sha256 == task.manifest.queries_sha256
-        shard = _Shard(source=source, asked=task.asked, is_tied=is_same)
-        found = shard.open()
+        read = partial(Answers.open, source, task.asked, is_tied=is_same)
+        found = read()
         if not (len(found.table) or is_same):
             stale.append(source)
             continue
-        shards.setdefault(task.folder, []).append(replace(shard, kept=found) if room.takes(found) else shard)
+        shards.setdefault(task.folder, []).append(partial(_same, found) if room.takes(found) else read)
         runs.append((source, _share_of(run, found)))
     left = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(run for _, run in runs))
     answers = StoredAnswers({task: partial(_merged, some) for task, some in shards.items()}, task_of)

@@ -114,8 +114,8 @@ def test_what_was_learned_goes_to_every_process_that_is_asked(request_of, name) 
     images = tiny_images()
     request = request_of(name)
     result = train_segmenter(request, images)
-    assert '"places": ["drawn-east", "drawn-west"]' in result.text
-    taught, untaught = (told(request, images[0], learned=text)[0] for text in (result.text, None))
+    assert '"places": ["drawn-east", "drawn-west"]' in result.learned
+    taught, untaught = (told(request, images[0], learned=text)[0] for text in (result.learned, None))
     assert taught.status == "ok"
     at = images[0].classes.index("building")
     is_roof, is_none = (images[0].labels[at] == label for label in (1, 0))
@@ -127,7 +127,7 @@ def test_what_was_learned_goes_to_every_process_that_is_asked(request_of, name) 
 
 def test_learning_reads_files_where_they_lie_and_the_same_images_give_the_same_text(request_of, tmp_path) -> None:
     files = LabelledFiles(write_labelled(tmp_path / "out" / "tasks" / "images", tiny_images()))
-    texts = {train_segmenter(request_of("Learns"), images).text for images in (files, tiny_images())}
+    texts = {train_segmenter(request_of("Learns"), images).learned for images in (files, tiny_images())}
     assert len(texts) == 1
     assert None not in texts
 
@@ -144,7 +144,7 @@ def test_learning_reads_files_where_they_lie_and_the_same_images_give_the_same_t
 )
 def test_a_failed_training_is_a_result_with_its_cause(request_of, name, status, words) -> None:
     result = train_segmenter(request_of(name), tiny_images()[:1])
-    assert (result.text, result.status) == (None, status)
+    assert (result.learned, result.status) == (None, status)
     assert re.search(words, result.message), result.message
 
 
@@ -170,8 +170,8 @@ def test_a_segmenter_that_learns_sees_no_labels_but_those_it_learns_from(request
     folders = ("out/tasks/train", "mine/train", "out/tasks/test", "mine/test")
     own, mine, *_ = (LabelledFiles(write_labelled(tmp_path / folder, tiny_images())) for folder in folders)
     for given in (own, mine):
-        assert train_segmenter(request_of("CountsLabels"), given).text == "0 beside 4"
-    assert train_segmenter(request_of("CountsLabels", is_shut_in=False), own).text == "12 beside 4"
+        assert train_segmenter(request_of("CountsLabels"), given).learned == "0 beside 4"
+    assert train_segmenter(request_of("CountsLabels", is_shut_in=False), own).learned == "12 beside 4"
 
 
 @pytest.mark.parametrize(
@@ -208,7 +208,7 @@ def test_an_error_of_our_own_costs_one_image_and_is_logged(request_of, tmp_path,
         raise RuntimeError("no such thing")
 
     request = request_of("Good")
-    monkeypatch.setattr("sasgeo_bench.running.segmenter_process.image_bytes", fail)
+    monkeypatch.setattr("sasgeo_bench.running.segmenting.image_bytes", fail)
     with SegmenterRun(request, loaded(request)) as run:
         reply = run.segment(tiny_images()[0])
     assert reply.status == "crash"

@@ -2,21 +2,20 @@
 """Answers of entries, as they go to the processes that fit rejectors."""
 
 import pickle
+from functools import partial
 from pathlib import Path
 
-from sasgeo_bench.running.prediction_files import Answers
-from sasgeo_bench.scoring.entries import _Room, _Shard
+from sasgeo_bench.matching.matcher import Prediction
+from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
+from sasgeo_bench.scoring.entries import _merged, _Room, _same
 
 
 def test_answers_that_are_kept_in_memory_go_to_other_processes():
-    answers = Answers.of([])
-    assert _Room(0).takes(answers)
-    kept = _Shard(source=Path("nowhere"), asked={}, is_tied=True, kept=answers)
-    assert pickle.loads(pickle.dumps(kept)).open().table.equals(answers.table)  # noqa: S301 - written here
+    kept = partial(_merged, [partial(_same, Answers.of([Prediction(query_id="a")]))])
+    stored = StoredAnswers({Path("there"): kept}, {"a": Path("there")})
+    assert pickle.loads(pickle.dumps(stored))["a"] == Prediction(query_id="a")  # noqa: S301 - written here
 
 
-def test_answers_without_room_are_read_again(monkeypatch):
+def test_there_is_room_for_answers_until_it_is_taken():
+    assert _Room(0).takes(Answers.of([]))
     assert not _Room(-1).takes(Answers.of([]))
-    monkeypatch.setattr(Answers, "open", lambda *asked, **more: (asked, more))
-    shard = _Shard(source=Path("there"), asked={"a": "b"}, is_tied=True)
-    assert shard.open() == ((Path("there"), {"a": "b"}), {"is_tied": True})

@@ -29,6 +29,8 @@ from sasgeo_bench.texts import (
     one_line,
 )
 
+FORBID_MORE: Final = ConfigDict(extra="forbid")  # of what a process sends
+
 Status = Literal["ok", "timeout", "crash", "invalid", "refused", "not applicable"]
 STATUSES: Final[tuple[Status, ...]] = get_args(Status)
 SOUND: Final[frozenset[Status]] = frozenset({"ok", "refused", "not applicable"})  # of a matcher that works
@@ -75,6 +77,8 @@ class Prediction:
     is_accepted: bool | None = None
     covariance: tuple[float, ...] | None = None
 
+    __pydantic_config__ = FORBID_MORE
+
 
 def matcher_hash(spec: str, version: str, code: bytes, settings: str) -> str:
     """Return 12 hex digits that identify a run: by the name, version and code of its matcher, and its settings."""
@@ -87,7 +91,6 @@ def matcher_hash(spec: str, version: str, code: bytes, settings: str) -> str:
 Need = Literal["position", "yaw", "scale", "vectors", "image", "imagery", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
 MOST_SAID: Final = 4000  # characters of a field of a card
-FORBID_MORE: Final = ConfigDict(extra="forbid")  # of a card as a process sends it
 MOST_LISTED: Final = 1000  # items of a field
 MOST_SHOWN: Final = 80  # of a wrong one
 MOST_LEARNED_BYTES: Final = 2**20  # of a learned text, as UTF-8

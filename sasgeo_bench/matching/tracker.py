@@ -7,6 +7,7 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose, Prior
@@ -14,6 +15,7 @@ from sasgeo_bench.matching.matcher import Match, MatcherCard, Prediction, check_
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import Head, Query
 
+ROW: Final = TypeAdapter(Prediction)  # as a plugin's process sends it, in JSON
 SIDE: Final = 3  # of a covariance: east, north, yaw
 MOST_VARIANCE: Final = 1e12  # m2 or deg2
 
@@ -113,6 +115,16 @@ def match_of(fix: Fix) -> Match:
         scores=(*(1.0 for _ in first), *(weight for _, weight in modes)),
         confidence=fix.confidence,
         diagnostics=fix.diagnostics,
+    )
+
+
+def row_of(match: Match, query_id: str) -> Prediction:
+    """Return a checked answer to a query as a row."""
+    return Prediction(
+        query_id=query_id,
+        candidates=tuple(zip(match.poses, match.scores, strict=True)),
+        confidence=match.confidence,
+        diagnostics=match.diagnostics,
     )
 
 

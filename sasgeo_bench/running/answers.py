@@ -384,7 +384,9 @@ class _Map:
         except Exception as error:  # noqa: BLE001 - any failure costs only its own row
             failed = failed_by_us(self._plan, error)
             return replace(row, status=failed.status, message=failed.message)
-        return replace(found, query_id=query.query_id, latency_s=reply.seconds, matcher_s=reply.own_s)
+        # Nothing but the answer itself is taken over from the process.
+        found = replace(found, query_id=query.query_id, status="ok", message="")
+        return replace(found, latency_s=reply.seconds, matcher_s=reply.own_s)
 
     def _failed_training(self) -> Reply | None:
         """Return the reply to every query after a failed training; starts no process."""

@@ -2,7 +2,7 @@
 """Train a segmenter and ask it about images, in processes of its own; a failure costs one image and is recorded."""
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import ClassVar, Final, Self
 
 import numpy as np
-from pydantic import JsonValue, TypeAdapter
+from pydantic import TypeAdapter
 
 from sasgeo_bench.errors import ImageError, MatchError
 from sasgeo_bench.files.folders import scratch_folder
@@ -24,12 +24,11 @@ from sasgeo_bench.running.failures import LOG, guard, our_failure
 from sasgeo_bench.running.oracle import ISOLATION
 from sasgeo_bench.running.plan import hidden_below, segmenter_code
 from sasgeo_bench.running.training import failed_training
-from sasgeo_bench.running.worker import Limits, PluginProcess, PluginReply, Reach, Sound, checked, loaded_card
+from sasgeo_bench.running.worker import Limits, PluginProcess, PluginReply, Reach, loaded_card
 from sasgeo_bench.sensing.image import AerialImage, LabelledFiles, LabelledImage, image_bytes, write_labelled
 from sasgeo_bench.sensing.segmentation import CERTAIN, MOST_CLASSES, SILENT, Segmentation
 
 SegmenterReply = PluginReply[SegmenterCard, Segmentation]
-_CARD: Final = TypeAdapter(SegmenterCard)
 
 
 @dataclass(kw_only=True)
@@ -38,6 +37,7 @@ class SegmenterProcess(PluginProcess[SegmenterCard, Segmentation]):
 
     door: ClassVar[str] = "segmenter"
     most_learned_bytes: ClassVar[int] = MOST_TEXT_BYTES
+    card: ClassVar[TypeAdapter[SegmenterCard]] = TypeAdapter(SegmenterCard)
 
     learned: str | None = None
     _asked: tuple[AerialImage, tuple[str, ...]] | None = None
@@ -57,12 +57,8 @@ class SegmenterProcess(PluginProcess[SegmenterCard, Segmentation]):
     def _luggage(self) -> bytes | None:
         return None if self.learned is None else self.learned.encode()
 
-    def _card(self, given: Mapping[str, JsonValue]) -> SegmenterCard:
-        return checked(_CARD, given)
-
-    def _found(self, answer: Sound, data: bytes) -> Segmentation:
+    def _found(self, data: bytes) -> Segmentation:
         """Return the segmentation that the bytes are, of the image that was asked about."""
-        del answer
         if self._asked is None:
             raise MatchError("nobody asked about an image")
         image, classes = self._asked

@@ -9,7 +9,7 @@ import traceback
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
 
@@ -20,8 +20,6 @@ from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.follower import Follower
 from sasgeo_bench.matching.matcher import (
     MOST_LEARNED_BYTES,
-    Learner,
-    Match,
     Matcher,
     Training,
     check_learned,
@@ -29,7 +27,7 @@ from sasgeo_bench.matching.matcher import (
     is_followed,
 )
 from sasgeo_bench.matching.plugins import load_method
-from sasgeo_bench.matching.tracker import Tracker, check_fix, match_of
+from sasgeo_bench.matching.tracker import ROW, Tracker, check_fix, match_of, row_of
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running import wire
@@ -39,6 +37,7 @@ from sasgeo_bench.texts import message_of, one_line
 
 if TYPE_CHECKING:
     from sasgeo_bench.geometry.grid import Grid
+    from sasgeo_bench.matching.segmenter import Segmenter
 
 Answer = tuple[wire.Message, bytes]  # to a question that was answered, and the bytes that follow it
 
@@ -46,7 +45,7 @@ MOST_MAPS: Final = 2  # cached while a matcher trains
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
-Plugin = TypeVar("Plugin")
+Plugin = TypeVar("Plugin", bound="Matcher | Tracker | Segmenter")
 
 
 class PluginServer(ABC, Generic[Plugin]):
@@ -72,7 +71,7 @@ class PluginServer(ABC, Generic[Plugin]):
                 content, data = self._answers()[message["kind"]](blob, **fields)
                 answer = wire.packed({**head, "status": "ok", **content}, data)
             except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
-                answer = wire.packed({**head, **_failure(error, package=_package_of(self._made))})
+                answer = wire.packed({**head, **_failure(error, plugin=self._made)})
             try:
                 wire.put(self.channel, answer)
             except wire.Closed:  # the runner waited no longer
@@ -93,9 +92,15 @@ class PluginServer(ABC, Generic[Plugin]):
             self._made = self._make()
         return self._made
 
-    def _learned(self, learn: Callable[[], object]) -> Answer:
+    def _load(self, _: bytes) -> Answer:
+        return {"card": asdict(self.plugin.card), "learns": callable(getattr(self.plugin, "learn", None))}, b""
+
+    def _learned(self, training: object) -> Answer:
+        learn = getattr(self.plugin, "learn", None)
+        if not callable(learn):
+            raise MatchError(f"{self.plugin.card.name} has no learn()")
         with (used := Clock()):
-            learned = learn()
+            learned = learn(training)
         return {"seconds": used.seconds}, check_learned(learned, most_bytes=self.most_learned_bytes).encode()
 
 
@@ -113,16 +118,9 @@ class Server(PluginServer[Matcher | Tracker]):
     def _answers(self) -> Mapping[str, Callable[..., Answer]]:
         return {"load": self._load, "learn": self._learn, "prepare": self._prepare, "match": self._match}
 
-    def _load(self, _: bytes) -> Answer:
-        return {"card": asdict(self.plugin.card), "learns": isinstance(self.plugin, Learner)}, b""
-
     def _learn(self, blob: bytes, *, regions: Mapping[str, str], query_bytes: Sequence[int]) -> Answer:
-        learner = self.plugin
-        if not isinstance(learner, Learner):
-            raise MatchError(f"{learner.card.name} has no learn()")
-        pairs = tuple(pairs_from(query_bytes, blob))
         maps = Maps({name: Path(folder) for name, folder in regions.items()})
-        return self._learned(lambda: learner.learn(Training(regions=maps, pairs=pairs)))
+        return self._learned(Training(regions=maps, pairs=tuple(pairs_from(query_bytes, blob))))
 
     def _prepare(self, _: bytes, *, region: str, learned: str | None) -> Answer:
         reading, looking, matcher = _Cost(), _Cost(), self.plugin
@@ -137,12 +135,12 @@ class Server(PluginServer[Matcher | Tracker]):
     def _match(self, blob: bytes, *, top_k: int) -> Answer:
         query, matcher = query_from(blob), self.plugin
         if isinstance(matcher, Tracker):
-            return _step(matcher, query, top_k), b""
+            return _step(matcher, query, top_k)
         if query.step is not None and is_followed(matcher.card):
-            return _step(self._following(matcher), query, top_k), b""
+            return _step(self._following(matcher), query, top_k)
         with (used := Clock()):
             match = matcher.match(query, top_k=top_k)
-        return {**used.times(), "match": match_row(check_match(match, query, top_k=top_k))}, b""
+        return used.times(), ROW.dump_json(row_of(check_match(match, query, top_k=top_k), query.query_id))
 
     def _following(self, matcher: Matcher) -> Tracker:
         if self._follower is None:
@@ -150,7 +148,7 @@ class Server(PluginServer[Matcher | Tracker]):
         return self._follower
 
 
-def _step(tracker: Tracker, query: Query, top_k: int) -> wire.Message:
+def _step(tracker: Tracker, query: Query, top_k: int) -> Answer:
     """Answer the next view of a flight; its first one begins it."""
     if query.step is None:
         raise MatchError(f"{tracker.card.name} follows flights, and this query is a view alone")
@@ -159,12 +157,12 @@ def _step(tracker: Tracker, query: Query, top_k: int) -> wire.Message:
             tracker.start(query.prior)
         found = tracker.step(query)
     fix = check_fix(found, top_k=top_k)
-    covariance = None if fix.covariance is None else np.asarray(fix.covariance).ravel().tolist()
-    row = {**match_row(match_of(fix)), "is_accepted": fix.is_accepted, "covariance": covariance}
-    return {**used.times(), "match": row}
+    covariance = None if fix.covariance is None else tuple(np.asarray(fix.covariance).ravel().tolist())
+    row = replace(row_of(match_of(fix), query.query_id), is_accepted=fix.is_accepted, covariance=covariance)
+    return used.times(), ROW.dump_json(row)
 
 
-def _failure(error: Exception, *, package: str) -> wire.Message:
+def _failure(error: Exception, *, plugin: object) -> wire.Message:
     """Describe an error as an answer; one that nobody foresaw with the last line of the plugin's package on its way."""
     if isinstance(error, MatchError):
         return {"status": "invalid", "message": one_line(str(error))}
@@ -172,22 +170,13 @@ def _failure(error: Exception, *, package: str) -> wire.Message:
         return {"status": "crash", "message": "out of memory"}
     is_refused = isinstance(error, OSError) and error.errno in _REFUSED
     status = "refused" if is_refused else "crash"
-    return {"status": status, "message": one_line(message_of(error) + _last_line(error, package))}
-
-
-def _package_of(plugin: object) -> str:
-    """Return the package that the class of a plugin lies in; empty for None."""
-    return "" if plugin is None else str(type(plugin).__module__).partition(".")[0]
-
-
-def _last_line(error: Exception, package: str) -> str:
-    """Return file and line of the innermost code of a package that an error came through, in brackets; else nothing."""
+    package = str(type(plugin).__module__).partition(".")[0]
     lines = [
         f" ({Path(frame.f_code.co_filename).name}:{line})"
         for frame, line in traceback.walk_tb(error.__traceback__)
-        if package and str(frame.f_globals.get("__name__")).partition(".")[0] == package
+        if plugin is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == package
     ]
-    return lines[-1] if lines else ""
+    return {"status": status, "message": one_line("".join([message_of(error), *lines[-1:]]))}
 
 
 class Clock:
@@ -257,15 +246,3 @@ def _resident_bytes() -> int:
     except OSError:
         number = os.getpid()
     return int(psutil.Process(number).memory_info().rss)
-
-
-def match_row(match: Match) -> wire.Message:
-    """Return a checked answer as plain numbers."""
-    return {
-        "candidates": [
-            [pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale, score]
-            for pose, score in zip(match.poses, match.scores, strict=True)
-        ],
-        "confidence": match.confidence,
-        "diagnostics": [[name, value] for name, value in match.diagnostics.items()],
-    }

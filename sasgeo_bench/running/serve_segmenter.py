@@ -4,7 +4,6 @@
 import socket
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 from sasgeo_bench.errors import MatchError
@@ -12,7 +11,6 @@ from sasgeo_bench.matching.plugins import load_segmenter
 from sasgeo_bench.matching.segmenter import (
     MOST_TEXT_BYTES,
     ImageTraining,
-    LearningSegmenter,
     Segmenter,
     check_segmentation,
 )
@@ -35,15 +33,8 @@ class SegmenterServer(PluginServer[Segmenter]):
     def _answers(self) -> Mapping[str, Callable[..., Answer]]:
         return {"load": self._load, "learn": self._learn, "segment": self._segment}
 
-    def _load(self, _: bytes) -> Answer:
-        return {"card": asdict(self.plugin.card), "learns": isinstance(self.plugin, LearningSegmenter)}, b""
-
     def _learn(self, _: bytes, *, images: Sequence[str]) -> Answer:
-        learner = self.plugin
-        if not isinstance(learner, LearningSegmenter):
-            raise MatchError(f"{learner.card.name} has no learn()")
-        training = ImageTraining(images=LabelledFiles([Path(path) for path in images]))
-        return self._learned(lambda: learner.learn(training))
+        return self._learned(ImageTraining(images=LabelledFiles([Path(path) for path in images])))
 
     def _segment(self, blob: bytes) -> Answer:
         image, segmenter = image_from(blob), self.plugin

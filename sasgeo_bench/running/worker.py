@@ -20,14 +20,13 @@ from types import TracebackType
 from typing import IO, Annotated, Any, ClassVar, Final, Generic, Literal, Protocol, Self, TypeVar
 
 import psutil
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, Strict, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
 
 import sasgeo_bench.running.child
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import check_card_name, import_paths
-from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import (
     MOST_LEARNED_BYTES,
     MOST_SAID,
@@ -36,7 +35,7 @@ from sasgeo_bench.matching.matcher import (
     Status,
     check_learned,
 )
-from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE
+from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
@@ -46,11 +45,8 @@ from sasgeo_bench.sensing.image import LABELLED
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_files import pairs_bytes
 from sasgeo_bench.texts import (
-    BOUNDS,
     MOST_CANDIDATES,
-    MOST_DIAGNOSTICS,
     MOST_MESSAGE,
-    MOST_NAME,
     MOST_S,
     is_line,
     one_line,
@@ -92,7 +88,7 @@ class PluginReply(Generic[AnyCard, Found]):
     found: Found | None = None
 
 
-Reply = PluginReply[MatcherCard, Prediction]  # of a matcher or tracker; its prediction has no id yet
+Reply = PluginReply[MatcherCard, Prediction]  # of a matcher or tracker
 
 
 def _line(text: str) -> str:
@@ -101,35 +97,8 @@ def _line(text: str) -> str:
     return text
 
 
-def _bounded(name: str) -> Any:  # noqa: ANN401 - a field of pydantic
-    least, most = BOUNDS[name]
-    return Field(ge=least, le=most)
-
-
 Line = Annotated[str, AfterValidator(_line)]
-Metres = Annotated[float, _bounded("easting_m")]
-Candidate = Annotated[  # JSON has no tuples: a list of just as many is one
-    tuple[
-        Metres,
-        Metres,
-        Annotated[float, _bounded("yaw_deg")],
-        Annotated[float, _bounded("scale")],
-        Annotated[float, _bounded("score")],
-    ],
-    Strict(strict=False),
-]
-Diagnostic = Annotated[
-    tuple[Annotated[Line, Field(min_length=1, max_length=MOST_NAME)], Annotated[float, _bounded("diagnostics")]],
-    Strict(strict=False),
-]
-Variance = Annotated[float, Field(ge=-MOST_VARIANCE, le=MOST_VARIANCE)]
 Seconds = Annotated[float, Field(ge=0, le=MOST_S)]
-
-
-def _once(pairs: list[tuple[str, float]]) -> list[tuple[str, float]]:
-    if len(dict(pairs)) != len(pairs):
-        raise ValueError("a name is there twice")
-    return pairs
 
 
 class Strictly(BaseModel):
@@ -143,28 +112,7 @@ class _Failed(Strictly):
     message: Annotated[Line, Field(max_length=MOST_MESSAGE)]
 
 
-class _Row(Strictly):
-    candidates: Annotated[list[Candidate], Field(max_length=MOST_CANDIDATES)]
-    confidence: Annotated[float, _bounded("confidence")] | None
-    diagnostics: Annotated[list[Diagnostic], Field(max_length=MOST_DIAGNOSTICS), AfterValidator(_once)]
-    is_accepted: bool | None = None
-    covariance: Annotated[list[Variance], Field(min_length=SIDE**2, max_length=SIDE**2)] | None = None
-
-    def prediction(self) -> Prediction:
-        return Prediction(
-            query_id="",
-            candidates=tuple(
-                (Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale), score)
-                for x, y, yaw, scale, score in self.candidates
-            ),
-            confidence=self.confidence,
-            diagnostics=dict(self.diagnostics),
-            is_accepted=self.is_accepted,
-            covariance=None if self.covariance is None else tuple(self.covariance),
-        )
-
-
-class Sound(Strictly):
+class _Sound(Strictly):
     """A sound answer, with the fields of its question (`_FIELDS`)."""
 
     status: Literal["ok"]
@@ -173,23 +121,22 @@ class Sound(Strictly):
     seconds: Seconds | None = None
     cpu_s: Annotated[float, Field(ge=0)] = 0.0
     grown_bytes: Annotated[int, Field(ge=0, le=_MOST_BYTES)] | None = None
-    match: _Row | None = None
 
 
-# What the answer to each kind of question holds. The bytes after it are a learned text, or a segmentation.
+# What the answer to each kind of question holds. The bytes after it are a learned text, a row, or a segmentation.
 _FIELDS: Final[Mapping[str, frozenset[str]]] = {
     "load": frozenset({"card", "learns"}),
     "learn": frozenset({"seconds"}),
     "prepare": frozenset({"seconds", "grown_bytes"}),
-    "match": frozenset({"seconds", "cpu_s", "match"}),
+    "match": frozenset({"seconds", "cpu_s"}),
     "segment": frozenset({"seconds", "cpu_s"}),
 }
 
 
 def checked(kind: TypeAdapter[Checked], given: object) -> Checked:
-    """Return what a process sent, as its type; raise `MatchError`, in one line, if it is none."""
+    """Return what a process sent, in bytes or read, as its type; raise `MatchError`, in one line, if it is none."""
     try:
-        return kind.validate_python(given)
+        return kind.validate_json(given, strict=True) if isinstance(given, bytes) else kind.validate_python(given)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, first["loc"]))[:60]  # characters of where a fault is
@@ -198,8 +145,7 @@ def checked(kind: TypeAdapter[Checked], given: object) -> Checked:
 
 
 _FAILED: Final = TypeAdapter(_Failed)
-_SOUND: Final = TypeAdapter(Sound)
-_CARD: Final = TypeAdapter(MatcherCard)
+_SOUND: Final = TypeAdapter(_Sound)
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
 _KEPT_BYTES: Final = 4000  # of a matcher's output
 _START_S: Final = 120.0
@@ -243,6 +189,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
 
     door: ClassVar[str]
     most_learned_bytes: ClassVar[int]
+    card: ClassVar[TypeAdapter[Any]]  # of this kind of plugin
 
     spec: str
     reach: Reach
@@ -268,12 +215,8 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         self.end()
 
     @abstractmethod
-    def _card(self, given: Mapping[str, JsonValue]) -> AnyCard:
-        """Read a card; raise `MatchError` if it is none."""
-
-    @abstractmethod
-    def _found(self, answer: Sound, data: bytes) -> Found | None:
-        """Read what was found for a query or an image, and the bytes after it; raise `MatchError` if it is none."""
+    def _found(self, data: bytes) -> Found:
+        """Read what was found for a query or an image; raise `MatchError` if it is none."""
 
     def _read(self, kind: str, given: Message, data: bytes, *, nonce: str) -> PluginReply[AnyCard, Found]:
         """Read an answer to a question of a kind, and its bytes; raise `MatchError`, in one line, if it is none.
@@ -294,11 +237,11 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
             status="ok",
             own_s=answer.seconds,
             cpu_s=answer.cpu_s,
-            card=None if answer.card is None else self._card(answer.card),
+            card=None if answer.card is None else checked(self.card, answer.card),
             learns=answer.learns,
             learned=self._learned_text(data) if kind == "learn" else None,
             grown_bytes=answer.grown_bytes,
-            found=self._found(answer, data) if kind in {"match", "segment"} else None,
+            found=self._found(data) if kind in {"match", "segment"} else None,
         )
 
     def _learned_text(self, data: bytes) -> str:
@@ -489,6 +432,7 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
 
     door: ClassVar[str] = "matcher"
     most_learned_bytes: ClassVar[int] = MOST_LEARNED_BYTES
+    card: ClassVar[TypeAdapter[MatcherCard]] = TypeAdapter(MatcherCard)
 
     _region: Path | None = None
     _learned: str | None = None
@@ -527,12 +471,8 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
             self.end()
         return reply
 
-    def _card(self, given: Mapping[str, JsonValue]) -> MatcherCard:
-        return checked(_CARD, given)
-
-    def _found(self, answer: Sound, data: bytes) -> Prediction | None:
-        del data  # no answer of a matcher has any
-        return None if answer.match is None else answer.match.prediction()
+    def _found(self, data: bytes) -> Prediction:
+        return check_prediction(checked(ROW, data), None, top_k=MOST_CANDIDATES)
 
 
 def loaded_card(process: PluginProcess[AnyCard, Found], *, group: str, is_oracle: bool = False) -> tuple[AnyCard, bool]:

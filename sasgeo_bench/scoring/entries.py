@@ -537,7 +537,7 @@ def score_entries(
             name = item.entry.name
             if name in parts and task.folder in item.asked:
                 with failures.of(name):
-                    parts[name].append(_scored(item, asked))
+                    parts[name].append(asked.scored(item.predictions.of_task(task.folder)))
                     continue
                 del parts[name]
     scores: dict[str, pd.DataFrame] = {}
@@ -623,10 +623,6 @@ def _places(split: Split | None) -> dict[str, Mapping[str, str]]:
 def design_rows(task: Task, split: Split | None) -> pd.DataFrame:
     """Return a row for each query or flight of one task, scored without an answer; raise as `score_task` does."""
     return _Asked.of(task, split).scored(Answers.of([])).whole
-
-
-def _scored(item: EntryAnswers, asked: "_Asked") -> "_Part":
-    return asked.scored(item.predictions.of_task(asked.task.folder))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

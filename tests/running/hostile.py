@@ -321,26 +321,26 @@ class LiesOnTheWire(Plain):
         return super().match(query, top_k=top_k)
 
 
-ANSWER = (
-    '{"nonce": "NONCE", "status": "ok", "seconds": 0.1, "cpu_s": 0.1, '
-    '"match": {"candidates": %s, "confidence": %s, "diagnostics": %s}}'
-)
+ANSWER = '{"nonce": "NONCE", "status": "ok", "seconds": 0.1, "cpu_s": 0.1}'
+WITHHELD_ROW = '{"query_id": "", "candidates": []}'
 
 
-def write_past_the_server(text, *, times=1):
+def write_past_the_server(text, row="", *, times=1):
     """Write a message to the socket of this process, as an answer to the question that was asked last."""
     frame = sys._getframe()
     while not (isinstance(frame.f_locals.get("message"), dict) and "self" in frame.f_locals):
         frame = frame.f_back
     data = text.replace("NONCE", frame.f_locals["message"]["nonce"]).encode()
-    frame.f_locals["self"].channel.sendall((len(data).to_bytes(4, "big") + bytes(4) + data) * times)
+    head = len(data).to_bytes(4, "big") + len(row).to_bytes(4, "big")
+    frame.f_locals["self"].channel.sendall((head + data + row.encode()) * times)
 
 
 class FarAway(Plain):
     """Answers past all checks of its own process, with a place that is none."""
 
     def match(self, query, *, top_k):
-        write_past_the_server(ANSWER % ("[[1e300, 0.0, 0.0, 1.0, 1.0]]", "null", "[]"))
+        far = '{"query_id": "", "candidates": [[{"easting_m": 1e300, "northing_m": 0.0, "yaw_deg": 0.0}, 1.0]]}'
+        write_past_the_server(ANSWER, far)
         time.sleep(1000)
 
 
@@ -354,7 +354,7 @@ class AnswersInAdvance(Plain):
     """Says at once what it will answer to the next question, which then seems to take no time."""
 
     def match(self, query, *, top_k):
-        write_past_the_server(ANSWER % ("[]", "null", "[]"), times=2)
+        write_past_the_server(ANSWER, WITHHELD_ROW, times=2)
         return super().match(query, top_k=top_k)
 
 

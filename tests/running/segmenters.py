@@ -79,14 +79,6 @@ class CannotWithout(NeedsTraining):
     card = SegmenterCard(name="cannot-without", **SAID)
 
 
-class LearnsByChance(Learns):
-    def learn(self, training):
-        return os.urandom(8).hex()
-
-    def segment(self, image, *, learned):
-        return Good.segment(Good(), image, learned=None)
-
-
 class LearnsNothing(Learns):
     def learn(self, training):
         raise ValueError("too few roofs")

@@ -2,6 +2,7 @@
 """Whatever a matcher's process sends is a reply or one line that says why it is none; never anything else."""
 
 import json
+import math
 import socket
 import threading
 import time
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match, Prediction, check_match
+from sasgeo_bench.matching.tracker import ROW as ANSWER_ROW
 from sasgeo_bench.running import wire
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.query import Head
@@ -34,13 +36,10 @@ SOUND = {
     "load": {"status": "ok", "card": CARD, "learns": False},
     "learn": {"status": "ok", "seconds": 1.0},
     "prepare": {"status": "ok", "seconds": 1.0, "grown_bytes": 5},
-    "match": {
-        "status": "ok",
-        "seconds": 0.5,
-        "cpu_s": 0.25,
-        "match": {"candidates": [[1, 2.0, 3.0, 1.0, 7.0]], "confidence": None, "diagnostics": [["margin", 1.0]]},
-    },
+    "match": {"status": "ok", "seconds": 0.5, "cpu_s": 0.25},
 }
+POSE = {"easting_m": 1, "northing_m": 2.0, "yaw_deg": 3.0, "scale": 1.0}
+ROW = {"query_id": "a", "candidates": [[POSE, 7.0]], "confidence": None, "diagnostics": {"margin": 1.0}}
 KINDS = tuple(SOUND)
 
 
@@ -49,13 +48,14 @@ def put(channel, data):
         channel.sendall(data)
 
 
-def received(text, kind="match", nonce="7", length=None):
+def received(text, kind="match", data=None, length=None):
     """What comes of the bytes of a message, as a runner reads them."""
     ours, theirs = socket.socketpair()
     with theirs, ours:
         threading.Thread(target=put, args=(theirs, (length or len(text)).to_bytes(4, "big") + bytes(4) + text)).start()
         said, _ = wire.receive(ours, deadline=time.monotonic() + 60, most_bytes=wire.MOST_BYTES)
-    return Worker(spec="", reach=Reach(readable=[], hidden=[]), limits=Limits())._read(kind, said, b"text", nonce=nonce)
+    data = data if data is not None else json.dumps(ROW).encode() if kind == "match" else b"text"
+    return Worker(spec="", reach=Reach(readable=[], hidden=[]), limits=Limits())._read(kind, said, data, nonce="7")
 
 
 def sound(kind, **changes):
@@ -96,53 +96,61 @@ def test_an_answer_to_another_question_is_refused(kind, change):
         received(sound(kind, **change), kind)
 
 
-def answer(candidates="[]", confidence="null", diagnostics="[]", seconds="0.1"):
-    row = f'{{"candidates": {candidates}, "confidence": {confidence}, "diagnostics": {diagnostics}}}'
-    return f'{{"nonce": "7", "status": "ok", "seconds": {seconds}, "cpu_s": 0.1, "match": {row}}}'
+def row(**changes):
+    return {"query_id": "a", **changes}
 
 
-def test_the_shape_of_an_answer_by_hand_is_that_of_a_sound_one():
-    assert received(answer().encode()).found == Prediction(query_id="")
+def at(place=0, score=1, **changes):
+    return [{"easting_m": place, "northing_m": 0, "yaw_deg": 0, "scale": 1, **changes}, score]
+
+
+def test_the_least_that_a_row_says_is_that_the_answer_was_withheld():
+    assert received(sound("match"), data=b'{"query_id": "a"}').found == Prediction(query_id="a")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(row(candidates=[one]) for one in (at(1e300), at(scale=0), at(yaw_deg=1e300), at(score=1e300), at(10**400))),
+        *(row(candidates=[one]) for one in (at(place=True), at("1"), [*at(), 1], None)),
+        row(candidates=[at()] * 1001),
+        '{"query_id": "a", "candidates": ' + "[" * 100_000 + "]" * 100_000 + "}",
+        '{"query_id": "a", "confidence": NaN}',
+        row(confidence=1.5),
+        '{"query_id": "a", "diagnostics": {"\\ud800": 1}}',
+        *(row(diagnostics=one) for one in ({"": 1}, {"x" * 65: 1}, {str(at): 1 for at in range(65)}, {"a": "b"})),
+        *(row(covariance=one) for one in ([1.0] * 8, [1.0] * 9, [1e300] * 9)),
+        row(more=1),
+        *({}, [], ""),
+    ],
+    ids=lambda data: ascii(data)[-60:],
+)
+def test_a_row_that_is_none_is_one_line(data):
+    with pytest.raises(MatchError) as refused:
+        received(sound("match"), data=(data if isinstance(data, str) else json.dumps(data)).encode())
+    check_line(str(refused.value))
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        answer(candidates="[[1e300, 0, 0, 1, 1]]"),
-        answer(candidates="[[0, 0, 0, 0, 1]]"),
-        answer(candidates="[[0, 0, 1e300, 1, 1]]"),
-        answer(candidates="[[0, 0, 0, 1, 1e300]]"),
-        answer(candidates=f"[[1{'0' * 5000}, 0, 0, 1, 1]]"),
-        answer(candidates="[[true, 0, 0, 1, 1]]"),
-        answer(candidates="[[0, 0, 0, 1, 1, 1]]"),
-        answer(candidates="[null]"),
-        answer(candidates=str([[0, 0, 0, 1, 1]] * 1001)),
-        answer(candidates="[" * 100_000 + "]" * 100_000),
-        answer(confidence="NaN"),
-        answer(confidence="1.5"),
-        answer(diagnostics='[["a", 1], ["a", 2]]'),
-        answer(diagnostics='[["\\ud800", 1]]'),
-        answer(diagnostics='[["", 1]]'),
-        answer(diagnostics=json.dumps([["x" * 65, 1]])),
-        answer(diagnostics=json.dumps([[str(at), 1] for at in range(65)])),
-        answer(seconds="Infinity"),
-        answer(seconds="-1"),
-        answer(seconds="1e9"),
-        answer().replace('"cpu_s"', '"seconds": 0.1, "cpu_s"'),
-        answer().replace('"cpu_s"', '"more": 0.1, "cpu_s"'),
-        answer().replace('"7"', '"8"'),
-        answer().replace('"ok"', '"timeout"'),
-        "",
-        '{"nonce": "7", "status": "crash", "message": "\\ud800"}',
-        json.dumps({"nonce": "7", "status": "crash", "message": "x" * (MOST_MESSAGE + 1)}),
+        sound("match", seconds=float("inf")),
+        sound("match", seconds=-1),
+        sound("match", seconds=1e9),
+        sound("match").replace(b'"cpu_s"', b'"seconds": 0.1, "cpu_s"'),
+        sound("match", more=0.1),
+        sound("match", nonce="8"),
+        sound("match", status="timeout"),
+        b"",
+        b'{"nonce": "7", "status": "crash", "message": "\\ud800"}',
+        json.dumps({"nonce": "7", "status": "crash", "message": "x" * (MOST_MESSAGE + 1)}).encode(),
     ],
-    ids=lambda text: text[-60:].encode("ascii", "replace").decode(),
+    ids=lambda text: ascii(text)[-60:],
 )
 def test_what_is_no_answer_is_one_line(text):
     with pytest.raises((MatchError, wire.Garbled)) as refused:
-        received(text.encode())
-    assert "\n" not in str(refused.value)
-    assert len(str(refused.value)) <= MOST_MESSAGE
+        received(text)
+    check_line(str(refused.value))
 
 
 @pytest.mark.parametrize(
@@ -199,6 +207,11 @@ def check_line(text):
 
 
 @st.composite
+def nearly_a_row(draw):
+    return replaced(ROW, draw(st.sampled_from(list(paths(ROW)))), draw(values))
+
+
+@st.composite
 def nearly(draw):
     kind = draw(st.sampled_from(KINDS))
     path = draw(st.sampled_from(list(paths(SOUND[kind]))))
@@ -206,11 +219,12 @@ def nearly(draw):
     return kind, {**changed, "nonce": "7"} if isinstance(changed, dict) else changed
 
 
-@given(nearly())
-def test_any_json_is_a_reply_or_one_line(case):
+@given(nearly(), nearly_a_row())
+def test_any_json_is_a_reply_or_one_line(case, row):
     kind, said = case
     try:
-        reply = received(json.dumps(said).encode(), kind)
+        data = json.dumps(row).encode() if kind == "match" else None
+        reply = received(json.dumps(said).encode(), kind, data=data)
     except (MatchError, wire.Garbled) as refused:
         check_line(str(refused))
         return
@@ -219,6 +233,16 @@ def test_any_json_is_a_reply_or_one_line(case):
     for found in [reply.found] if reply.found is not None else []:
         assert all(abs(pose.easting_m) <= 1e8 for pose, _ in found.candidates)
         assert all(name.isprintable() for name in found.diagnostics)
+
+
+@given(st.lists(st.floats(-1e8, 1e8), min_size=5, max_size=5))
+def test_numbers_come_as_they_were_sent(numbers):
+    x, y, yaw, score, margin = numbers
+    pose = Pose(easting_m=x, northing_m=y, yaw_deg=yaw % 360)
+    sent = Prediction(query_id="a", candidates=((pose, score),), diagnostics={"margin": margin})
+    found = received(sound("match"), data=ANSWER_ROW.dump_json(sent)).found
+    assert found == sent
+    assert math.copysign(1, found.candidates[0][1]) == math.copysign(1, score)
 
 
 @given(st.binary(max_size=60))

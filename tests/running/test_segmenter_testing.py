@@ -98,7 +98,6 @@ def test_a_segmenter_that_learns_has_two_rows_more(table) -> None:
 @pytest.mark.parametrize(
     ("name", "row", "words"),
     [
-        ("LearnsByChance", LEARNS, "another text the second time"),
         ("LearnsNothing", LEARNS, "crash: ValueError: too few roofs"),
         ("LearnsTooMuch", LEARNS, "expected at most 33554432"),
         ("CannotWithout", UNTAUGHT, "learned = None: image 0: crash: TypeError"),
@@ -114,11 +113,6 @@ def test_one_that_needs_what_it_does_not_learn_is_asked_nothing(table) -> None:
     rows = table("NeedsWhatItCannotLearn")
     assert tuple(rows) == (ROWS[0], "answers an image", ROWS[-1])
     assert failed(rows) == []
-
-
-def test_a_segmenter_that_takes_too_long_fails_by_its_time_alone(table, monkeypatch) -> None:
-    monkeypatch.setattr(testing, "_QUICK_S", 0.0)
-    assert failed(table("Good")) == ["time and memory"]
 
 
 @shut_in

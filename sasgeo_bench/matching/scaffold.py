@@ -4,13 +4,13 @@
 import keyword
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugins import CARD_FILE, MATCHERS, SEGMENTERS, SUITES, TRACKERS, shipped_names
+from sasgeo_bench.files.plugins import CARD_FILE, KINDS, MATCHERS, SEGMENTERS, SUITES, TRACKERS, shipped_names
 from sasgeo_bench.matching.submission import EXAMPLE
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
@@ -340,7 +340,7 @@ def _readme(place: str, *, words: str = _WORDS, commands: str = "", about: str =
     return _README % {"place": place, "words": words, "commands": commands, "about": about}
 
 
-class _Package(NamedTuple):
+class Package(NamedTuple):
     """Templates of a new package of one kind."""
 
     group: str  # of its entry point
@@ -348,10 +348,12 @@ class _Package(NamedTuple):
     readme: str
     card: str | None = None  # beside the code, where it is not in it
     attribute: str = "{cls}"  # what the entry point names
+    others: Mapping[str, str] = {}  # more files, or others in their place
+    taken: Mapping[str, Collection[str]] = {}  # names of ours that are no entry points, by kind
 
 
 _PACKAGES: Final = {
-    "matcher": _Package(
+    "matcher": Package(
         MATCHERS,
         _MATCHER,
         _readme(
@@ -367,7 +369,7 @@ sasgeo-bench enter docs/results/systems-objects --matcher {name}
         ),
         EXAMPLE,
     ),
-    "tracker": _Package(
+    "tracker": Package(
         TRACKERS,
         _TRACKER,
         _readme(
@@ -379,8 +381,8 @@ sasgeo-bench run --matcher {name} --tasks out/tasks/flight-clean/town-grid
         ),
         _TRACKER_CARD,
     ),
-    "segmenter": _Package(SEGMENTERS, _SEGMENTER, _readme("segmenter.py")),
-    "suite": _Package(
+    "segmenter": Package(SEGMENTERS, _SEGMENTER, _readme("segmenter.py")),
+    "suite": Package(
         SUITES,
         _SUITE,
         _readme(
@@ -395,6 +397,7 @@ sasgeo-bench inspect {name}/town-riverside --rows 6
             about=": queries under a stress of your own",
         ),
         attribute="SUITE",
+        taken={"suite": EVERY_SUITE},
     ),
 }
 
@@ -407,8 +410,13 @@ def package_files(kind: str, name: str) -> dict[str, str]:
     >>> sorted(package_files("tracker", "my-tracker"))[-2:]
     ['src/my_tracker/tracker.py', 'tests/test_conforms.py']
     """
-    package = _PACKAGES[kind]
-    _check_name(kind, name, package.group)
+    return files_of(_PACKAGES[kind], name)
+
+
+def files_of(package: Package, name: str) -> dict[str, str]:
+    """Return the text of every file of a package of some templates, as `package_files` does."""
+    kind = KINDS[package.group]
+    _check_name(kind, name, package)
     parts = re.split(r"[-_]", name)
     own = "".join(part.capitalize() for part in parts)
     # Words of the import lines of the module, which its own class must not be called
@@ -429,11 +437,13 @@ def package_files(kind: str, name: str) -> dict[str, str]:
         "src/{module}/__init__.py": '"""The package of the {kind} {name}."""\n',
         "src/{module}/{kind}.py": package.code,
         "tests/test_conforms.py": _TEST,
-    } | ({} if package.card is None else {f"src/{{module}}/{CARD_FILE}": package.card})
+        **({} if package.card is None else {f"src/{{module}}/{CARD_FILE}": package.card}),
+        **package.others,
+    }
     return {path.format(**words): text.format(**words) for path, text in files.items()}
 
 
-def _check_name(kind: str, name: str, group: str) -> None:
+def _check_name(kind: str, name: str, package: Package) -> None:
     """Raise `ConfigError` if a new plugin cannot have a name."""
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name):
@@ -443,11 +453,13 @@ def _check_name(kind: str, name: str, group: str) -> None:
         )
     if keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST:
         raise ConfigError(f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name")
-    if name in shipped_names(group) or (group == SUITES and name in EVERY_SUITE):
+    ours = ((kind, shipped_names(package.group)), *package.taken.items())
+    whose = next((one for one, names in ours if name in names), None)
+    if whose is not None:
         raise ConfigError(
-            f"{name!r} is a {kind} of sasgeo-bench itself, which would be used instead of yours; choose another"
+            f"{name!r} is a {whose} of sasgeo-bench itself, which would be used instead of yours; choose another"
         )
-    if group == TRACKERS and name in shipped_names(MATCHERS):
+    if package.group == TRACKERS and name in shipped_names(MATCHERS):
         raise ConfigError(f"{name!r} is a matcher of sasgeo-bench itself, which run would take instead; choose another")
 
 

@@ -17,8 +17,8 @@ from sasgeo_bench.publishing.archive import laid_tasks
 from sasgeo_bench.publishing.submissions import hold_submission
 from sasgeo_bench.regions.region_files import differing_files, read_features
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.running.prediction_files import parts_of
-from sasgeo_bench.scoring.submission_files import Violation, is_submission, set_aside, validate
+from sasgeo_bench.running.prediction_files import Violation, parts_of
+from sasgeo_bench.scoring.submission_files import is_submission, set_aside, validate
 from sasgeo_bench.tasks.build import check_task
 from sasgeo_bench.tasks.duplicates import constellations, search_split
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file

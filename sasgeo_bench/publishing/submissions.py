@@ -22,13 +22,12 @@ from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, sc
 from sasgeo_bench.publishing.archive_file import is_pack, read_pack
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_files import RUN, RunManifest
+from sasgeo_bench.running.prediction_files import RUN, RunManifest, Violation
 from sasgeo_bench.scoring.entries import check_name
 from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.submission_files import (
-    Violation,
     is_submission,
     list_submissions,
     read_submission,

@@ -792,17 +792,35 @@ _MOST_ITEMS: Final = {"candidates": MOST_CANDIDATES, "diagnostics": MOST_DIAGNOS
 _PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RowFault:
-    """A fault in one row: row number, column, value found, and value expected."""
+NO_ROW: Final = "no row for "  # begins what was found instead of an answer
 
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """One fault: file, where it is known, row index (-1 for the whole file), column, found and expected."""
+
+    file: str
     row: int
     column: str
     found: str
     expected: str
 
+    @property
+    def is_missing_row(self) -> bool:
+        """Return True if the fault is a query without a row."""
+        return self.found.startswith(NO_ROW)
 
-def far_fault(batch: pa.RecordBatch) -> RowFault | None:
+    def to_text(self) -> str:
+        """Return the fault in one line.
+
+        >>> Violation(file="mine.parquet", row=3, column="confidence", found="1.5", expected="0..1 or null").to_text()
+        'mine.parquet, row 3, confidence: found 1.5, expected 0..1 or null'
+        """
+        where = self.file if self.row < 0 else f"{self.file}, row {self.row}"
+        return f"{where}, {self.column}: found {self.found}, expected {self.expected}"
+
+
+def far_fault(batch: pa.RecordBatch) -> Violation | None:
     """Return the first list or text of some rows that is more than `FAR` times its bound, or None.
 
     Texts must be dictionaries. Nothing becomes an object of Python; `row_faults` finds what is shorter.
@@ -811,7 +829,7 @@ def far_fault(batch: pa.RecordBatch) -> RowFault | None:
     return next((fault for name, column in columns for fault in _far_faults(name, column)), None)
 
 
-def _far_faults(name: str, column: pa.Array) -> Iterator[RowFault]:
+def _far_faults(name: str, column: pa.Array) -> Iterator[Violation]:
     kind = column.type
     if name in _TEXTS and pa.types.is_dictionary(kind):
         yield from _longest(name, _text_lengths(column), "bytes", MOST_MESSAGE)
@@ -829,13 +847,13 @@ def _text_lengths(texts: pa.DictionaryArray) -> NDArray[np.int64]:
     return np.asarray(lengths.fill_null(0).cast(pa.int64()))
 
 
-def _longest(column: str, lengths: NDArray[np.int64], unit: str, most: int) -> Iterator[RowFault]:
+def _longest(column: str, lengths: NDArray[np.int64], unit: str, most: int) -> Iterator[Violation]:
     if len(lengths) and lengths.max() > FAR * most:
         row = int(np.argmax(lengths))
-        yield RowFault(row=row, column=column, found=f"{lengths[row]} {unit}", expected=f"at most {most}")
+        yield Violation(file="", row=row, column=column, found=f"{lengths[row]} {unit}", expected=f"at most {most}")
 
 
-def row_faults(table: pa.Table) -> Iterator[RowFault]:
+def row_faults(table: pa.Table) -> Iterator[Violation]:
     """Check every number, name and text of rows against the bounds of an answer (`texts.BOUNDS`).
 
     The table must have all columns of predictions. Faults come by column, then by row.
@@ -853,7 +871,7 @@ def row_faults(table: pa.Table) -> Iterator[RowFault]:
     yield from _of_diagnostics(table["diagnostics"])
 
 
-def _faults(column: str, is_wrong: Mask, expected: str, found: str, *values: NDArray[Any]) -> Iterator[RowFault]:
+def _faults(column: str, is_wrong: Mask, expected: str, found: str, *values: NDArray[Any]) -> Iterator[Violation]:
     """Yield a fault for each wrong row; `found` is formatted with the values of that row."""
     yield from _firsts(column, np.flatnonzero(is_wrong), expected, found, *(one[is_wrong] for one in values))
 
@@ -868,7 +886,7 @@ def _is_within(name: str, values: NDArray[np.float64]) -> Mask:
     return np.asarray((values >= least) & (values <= most))
 
 
-def _of_texts(table: pa.Table) -> Iterator[RowFault]:
+def _of_texts(table: pa.Table) -> Iterator[Violation]:
     """Check that names and statuses are known, and messages are lines."""
     for name, is_sound, expected in (
         ("query_id", bool, "the id of a query"),
@@ -888,7 +906,7 @@ def _texts(column: pa.ChunkedArray | pa.Array) -> tuple[NDArray[np.object_], NDA
     return texts, coded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
 
 
-def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
+def _of_candidates(column: pa.ChunkedArray) -> Iterator[Violation]:
     """Check that every row has a list, not too long, of complete candidates."""
     whole = column.combine_chunks()
     is_null = np.asarray(whole.is_null())
@@ -907,7 +925,7 @@ def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
         yield from _firsts("candidates", rows[is_wrong], bounds_text(name), f"{name} is {{:g}}", values[is_wrong])
 
 
-def _of_covariances(column: pa.ChunkedArray) -> Iterator[RowFault]:
+def _of_covariances(column: pa.ChunkedArray) -> Iterator[Violation]:
     """Check that every covariance is null, or nine numbers that are one."""
     whole = column.cast(pa.list_(pa.float64())).combine_chunks()
     is_given = ~np.asarray(whole.is_null())
@@ -926,7 +944,7 @@ def _of_covariances(column: pa.ChunkedArray) -> Iterator[RowFault]:
     yield from _faults("covariance", is_none, expected, "a matrix that is none")
 
 
-def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:
+def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[Violation]:
     """Check the number of diagnostics of each row, their names, each a line that is there once, and their numbers."""
     whole = column.cast(_PAIRS).combine_chunks()
     rows, items = pc.list_parent_indices(whole).to_numpy(), pc.list_flatten(whole)
@@ -948,8 +966,8 @@ def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:
 
 def _firsts(
     column: str, rows: NDArray[np.int64], expected: str, found: str, *values: NDArray[Any]
-) -> Iterator[RowFault]:
+) -> Iterator[Violation]:
     """Yield the first fault of each row among those of its items; `found` is formatted with the values of that item."""
     for row, at in zip(*np.unique(rows, return_index=True), strict=True):
         text = found.format(*(one[at] for one in values))[: 2 * MOST_NAME]
-        yield RowFault(row=int(row), column=column, found=text, expected=expected)
+        yield Violation(file="", row=int(row), column=column, found=text, expected=expected)

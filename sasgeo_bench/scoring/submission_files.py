@@ -8,7 +8,7 @@ import difflib
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,8 +27,10 @@ from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import (
     FLOWN_SCHEMA,
+    NO_ROW,
     PREDICTION_SCHEMA,
     RUN_SCHEMA,
+    Violation,
     check_lengths,
     differing_columns,
     prediction_of,
@@ -235,32 +237,6 @@ TaskName = tuple[str, str]  # suite and region
 Bounds = tuple[float, float, float, float]  # west, south, east, north, metres
 
 _ANSWERED: Final = "ok"
-_NO_ROW: Final = "no row for "
-
-
-@dataclass(frozen=True, slots=True)
-class Violation:
-    """One fault: file, row index (-1 for the whole file), column, found and expected."""
-
-    file: str
-    row: int
-    column: str
-    found: str
-    expected: str
-
-    @property
-    def is_missing_row(self) -> bool:
-        """Return True if the fault is a query without a row."""
-        return self.found.startswith(_NO_ROW)
-
-    def to_text(self) -> str:
-        """Return the fault in one line.
-
-        >>> Violation(file="mine.parquet", row=3, column="confidence", found="1.5", expected="0..1 or null").to_text()
-        'mine.parquet, row 3, confidence: found 1.5, expected 0..1 or null'
-        """
-        where = self.file if self.row < 0 else f"{self.file}, row {self.row}"
-        return f"{where}, {self.column}: found {self.found}, expected {self.expected}"
 
 
 def validate(path: Path, tasks: Sequence[Task]) -> Iterator[Violation]:
@@ -389,7 +365,7 @@ def _task_fault(item: AnsweredTask, found: str, expected: str) -> Violation:
 def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iterator[Violation]:
     for name in queries:
         if name not in seen:
-            yield Violation(file, -1, "query_id", f"{_NO_ROW}{name}", "one for every query")
+            yield Violation(file, -1, "query_id", f"{NO_ROW}{name}", "one for every query")
 
 
 def set_aside(path: Path, tasks: Sequence[Task]) -> int:
@@ -455,8 +431,7 @@ def _faults_by_row(file: str, table: pa.Table) -> dict[int, list[Violation]]:
     """Return numbers, names and texts out of their bounds, by row."""
     found: dict[int, list[Violation]] = {}
     for one in row_faults(table):
-        wrong = Violation(file, one.row, one.column, one.found, one.expected)
-        found.setdefault(one.row, []).append(wrong)
+        found.setdefault(one.row, []).append(replace(one, file=file))
     return found
 
 

@@ -9,10 +9,18 @@ from types import SimpleNamespace
 
 import pytest
 
-from sasgeo_bench.running import answers, plan, profiling, segmenter_testing, segmenting, testing, training
+from sasgeo_bench.running import (
+    answers,
+    plan,
+    profiling,
+    segmenter_testing,
+    segmenting,
+    serve_segmenter,
+    testing,
+    training,
+)
 from sasgeo_bench.running.segmenting import SegmenterProcess
 from sasgeo_bench.running.serve import PluginServer, Server
-from sasgeo_bench.running.serve_segmenter import SegmenterServer
 from sasgeo_bench.running.worker import PluginProcess, Worker
 
 
@@ -47,7 +55,7 @@ class ThreadedSegmenter(_Threaded, SegmenterProcess):
     """A segmenter, served by a thread."""
 
     def _server(self, theirs: socket.socket) -> PluginServer:
-        return SegmenterServer(theirs, spec=self.spec, luggage=self._luggage())
+        return serve_segmenter.Server(theirs, spec=self.spec, luggage=self.luggage.encode())
 
 
 @contextmanager

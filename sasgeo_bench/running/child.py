@@ -5,6 +5,7 @@ import gc
 import os
 import socket
 import sys
+from importlib import import_module
 
 from sasgeo_bench.running import wire
 
@@ -17,22 +18,13 @@ def main() -> None:
     serve(channel, luggage, **start)
 
 
-def serve(
-    channel: socket.socket, luggage: bytes, *, door: str, spec: str, scratch: str, paths: list[str], has_luggage: bool
-) -> None:
+def serve(channel: socket.socket, luggage: bytes, *, door: str, spec: str, scratch: str, paths: list[str]) -> None:
     """Load the plugin and answer; what is imported from here on comes from the runner's import path."""
     os.chdir(scratch)
     sys.path[:] = dict.fromkeys((*paths, *sys.path))
-    if door == "segmenter":
-        from sasgeo_bench.running.serve_segmenter import SegmenterServer  # noqa: PLC0415
-
-        gc.enable()
-        SegmenterServer(channel, spec=spec, luggage=luggage if has_luggage else None).run()
-        return
-    from sasgeo_bench.running.serve import Server  # noqa: PLC0415
-
+    server = import_module(f"sasgeo_bench.running.{'serve_segmenter' if door == 'segmenter' else 'serve'}").Server
     gc.enable()
-    Server(channel, spec=spec).run()
+    server(channel, spec=spec, luggage=luggage).run()
 
 
 if __name__ == "__main__":

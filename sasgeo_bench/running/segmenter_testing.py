@@ -71,7 +71,7 @@ class _SegmenterKit(Kit[SegmenterCard, Segmentation, AerialImage]):
         if self.learns:
             few = dict(list(self.images.items())[:1])
             yield from self.lessons(lambda: self.segmenter.learn(self.paths), few, self.count(len(self.paths)))
-            self.segmenter.learned = self.learned
+            self.segmenter.luggage = self.learned or ""
         if "training" in self.card.needs and self.learned is None:
             found = "the card needs training, and there is no learned text"
             yield Check(name="answers an image", outcome="not applicable", found=found)

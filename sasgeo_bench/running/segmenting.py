@@ -33,13 +33,12 @@ SegmenterReply = PluginReply[SegmenterCard, Segmentation]
 
 @dataclass(kw_only=True)
 class SegmenterProcess(PluginProcess[SegmenterCard, Segmentation]):
-    """The process of a segmenter; `learned` is the text that it gets with each image, None without training."""
+    """The process of a segmenter; `luggage` is the text that it gets with each image, empty without training."""
 
     door: ClassVar[str] = "segmenter"
     most_learned_bytes: ClassVar[int] = MOST_TEXT_BYTES
     card: ClassVar[TypeAdapter[SegmenterCard]] = TypeAdapter(SegmenterCard)
 
-    learned: str | None = None
     _asked: tuple[AerialImage, tuple[str, ...]] | None = None
 
     def learn(self, images: Sequence[Path]) -> SegmenterReply:
@@ -53,9 +52,6 @@ class SegmenterProcess(PluginProcess[SegmenterCard, Segmentation]):
         # 1.01: growth of bytes that do not become fewer by compression
         most_bytes = int(MOST_CLASSES * rows * cols * 1.01) + wire.MOST_BYTES
         return self._ask("segment", image_bytes(image), timeout_s=self.limits.match_s, most_bytes=most_bytes)
-
-    def _luggage(self) -> bytes | None:
-        return None if self.learned is None else self.learned.encode()
 
     def _found(self, data: bytes) -> Segmentation:
         """Return the segmentation that the bytes are, of the image that was asked about."""
@@ -192,7 +188,7 @@ class SegmenterRun:
         self._request, self._loaded, self._learned = request, loaded, learned
         self._patience = Patience("images")
         self._process = SegmenterProcess(
-            spec=request.spec, reach=request.reach(), limits=request.limits, learned=learned
+            spec=request.spec, reach=request.reach(), limits=request.limits, luggage=learned or ""
         )
 
     def __enter__(self) -> Self:

@@ -8,7 +8,7 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
@@ -49,13 +49,17 @@ Plugin = TypeVar("Plugin", bound="Matcher | Tracker | Segmenter")
 
 
 class PluginServer(ABC, Generic[Plugin]):
-    """Answers messages until the runner closes its end."""
+    """Answers messages until the runner closes its end: each kind of question by the method of its name.
+
+    A method is given the bytes after the question, and its fields.
+    """
 
     most_learned_bytes = MOST_LEARNED_BYTES
 
-    def __init__(self, channel: socket.socket, *, spec: str) -> None:
+    def __init__(self, channel: socket.socket, *, spec: str, luggage: bytes = b"") -> None:
         self.channel = channel
         self.spec = spec
+        self.luggage = luggage.decode()
         self._made: Plugin | None = None
 
     def run(self) -> None:
@@ -68,7 +72,7 @@ class PluginServer(ABC, Generic[Plugin]):
             head = {"nonce": message["nonce"]}
             fields = {name: value for name, value in message.items() if name not in {"kind", "nonce"}}
             try:
-                content, data = self._answers()[message["kind"]](blob, **fields)
+                content, data = getattr(self, f"_{message['kind']}")(blob, **fields)
                 answer = wire.packed({**head, "status": "ok", **content}, data)
             except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
                 answer = wire.packed({**head, **_failure(error, plugin=self._made)})
@@ -80,10 +84,6 @@ class PluginServer(ABC, Generic[Plugin]):
     @abstractmethod
     def _make(self) -> Plugin:
         """Import and make the plugin."""
-
-    @abstractmethod
-    def _answers(self) -> Mapping[str, Callable[..., Answer]]:
-        """Return what answers each kind of question, given the bytes after it and its fields."""
 
     @property
     def plugin(self) -> Plugin:
@@ -107,16 +107,11 @@ class PluginServer(ABC, Generic[Plugin]):
 class Server(PluginServer[Matcher | Tracker]):
     """Answers for a matcher, or a tracker."""
 
-    def __init__(self, channel: socket.socket, *, spec: str) -> None:
-        super().__init__(channel, spec=spec)
-        self._grid: Grid | None = None
-        self._follower: Tracker | None = None
+    _grid: "Grid | None" = None
+    _follower: Tracker | None = None
 
     def _make(self) -> Matcher | Tracker:
         return load_method(self.spec)
-
-    def _answers(self) -> Mapping[str, Callable[..., Answer]]:
-        return {"load": self._load, "learn": self._learn, "prepare": self._prepare, "match": self._match}
 
     def _learn(self, blob: bytes, *, regions: Mapping[str, str], query_bytes: Sequence[int]) -> Answer:
         maps = Maps({name: Path(folder) for name, folder in regions.items()})

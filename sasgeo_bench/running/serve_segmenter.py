@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Serve a runner for a segmenter, inside the sandbox: load, learn, segment."""
 
-import socket
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from sasgeo_bench.errors import MatchError
@@ -18,20 +17,13 @@ from sasgeo_bench.running.serve import Answer, Clock, PluginServer
 from sasgeo_bench.sensing.image import LabelledFiles, image_from
 
 
-class SegmenterServer(PluginServer[Segmenter]):
+class Server(PluginServer[Segmenter]):
     """Answers for a segmenter; `luggage` is the learned text, the same for all images of a process."""
 
     most_learned_bytes = MOST_TEXT_BYTES
 
-    def __init__(self, channel: socket.socket, *, spec: str, luggage: bytes | None = None) -> None:
-        super().__init__(channel, spec=spec)
-        self.learned = None if luggage is None else luggage.decode()
-
     def _make(self) -> Segmenter:
         return load_segmenter(self.spec)
-
-    def _answers(self) -> Mapping[str, Callable[..., Answer]]:
-        return {"load": self._load, "learn": self._learn, "segment": self._segment}
 
     def _learn(self, _: bytes, *, images: Sequence[str]) -> Answer:
         return self._learned(ImageTraining(images=LabelledFiles([Path(path) for path in images])))
@@ -40,7 +32,7 @@ class SegmenterServer(PluginServer[Segmenter]):
         image, segmenter = image_from(blob), self.plugin
         before = zlib.crc32(image.rgb.tobytes())
         with (used := Clock()):
-            found = segmenter.segment(image, learned=self.learned)
+            found = segmenter.segment(image, learned=self.luggage or None)
         checked = check_segmentation(found, image, classes=segmenter.card.classes)
         if zlib.crc32(image.rgb.tobytes()) != before:
             raise MatchError("segment() changed the picture that it was given: copy it first")

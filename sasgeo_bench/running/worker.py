@@ -194,6 +194,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
     spec: str
     reach: Reach
     limits: Limits
+    luggage: str = ""  # that a process gets at its start
     isolation: dict[str, str] = field(default_factory=dict)
     starts: int = 0
     _peak_bytes: int = 0
@@ -249,10 +250,6 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
             return check_learned(data.decode(), most_bytes=self.most_learned_bytes)
         except UnicodeDecodeError as error:
             raise MatchError("the learned text is no UTF-8") from error
-
-    def _luggage(self) -> bytes | None:
-        """Return bytes that a process of this door gets at its start, None for none."""
-        return None
 
     def load(self) -> PluginReply[AnyCard, Found]:
         """Import the plugin."""
@@ -331,9 +328,8 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
             wire.send(ours, asdict(self._policy(str(self._scratch))))
             self.isolation = self._started_isolation(ours)
         self.isolation["memory"] = _memory_words(self.limits, self._group)
-        luggage = self._luggage()
         start = {"door": self.door, "spec": self.spec, "scratch": str(self._scratch), "paths": import_paths(self.spec)}
-        wire.send(ours, start | {"has_luggage": luggage is not None}, luggage or b"")
+        wire.send(ours, start, self.luggage.encode())
         return ours
 
     @staticmethod

@@ -17,11 +17,11 @@ from sasgeo_bench.matching.matcher import Prediction, Status, lacks
 from sasgeo_bench.matching.tracker import check_prediction
 from sasgeo_bench.regions.region_files import check_files, read_manifest
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.failures import LOG, our_failure
 from sasgeo_bench.running.oracle import Oracle
 from sasgeo_bench.running.plan import RunPart, RunPlan, by_map, reach_of
 from sasgeo_bench.running.sandbox import PROMISES, joined
-from sasgeo_bench.running.training import failed_by_us, guarded
-from sasgeo_bench.running.worker import Reply, Worker
+from sasgeo_bench.running.worker import Reply, Worker, guarded
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_files import asked_under
 from sasgeo_bench.texts import one_line
@@ -319,7 +319,7 @@ class _Map:
                 if ready is None:
                     result = self._plan.training_result
                     region, text = self._writers[0].part.region, None if result is None else result.learned
-                    ready = guarded(self._plan, partial(worker.prepare, region, text))
+                    ready = self._guarded(partial(worker.prepare, region, text))
                     self._check_map(ready)
                     if ready.status != "ok":  # a map that is ready answers nothing yet
                         self._patience.note(ready.status, ready.message)
@@ -330,7 +330,7 @@ class _Map:
                         writer.add_process(worker, ready)
                 is_warm = is_warm or self._given_up() is not None
                 if ready.status == "ok" and not is_warm and self._lacks(group[0][1]) is None:
-                    guarded(self._plan, partial(worker.match, group[0][2], top_k=self._plan.request.top_k))
+                    self._guarded(partial(worker.match, group[0][2], top_k=self._plan.request.top_k))
                     is_warm = True
                 self._ask_group(schedule, worker, ready, group)
 
@@ -355,8 +355,11 @@ class _Map:
                     status=row.status, message=f"since frame {query.step.frame} of the flight: {row.message}"
                 )
 
+    def _guarded(self, ask: Callable[[], Reply]) -> Reply:
+        return guarded(ask, self._plan.run_folder, self._plan.card.name)
+
     def _asked(self, ask: Callable[[], Reply]) -> Reply:
-        reply = guarded(self._plan, ask)
+        reply = self._guarded(ask)
         self._patience.note(reply.status, reply.message)
         return reply
 
@@ -382,8 +385,8 @@ class _Map:
         except MatchError as error:
             return replace(row, status="invalid", message=one_line(str(error)))
         except Exception as error:  # noqa: BLE001 - any failure costs only its own row
-            failed = failed_by_us(self._plan, error)
-            return replace(row, status=failed.status, message=failed.message)
+            words = our_failure(self._plan.run_folder / LOG, self._plan.card.name, error)
+            return replace(row, status="crash", message=words)
         # Nothing but the answer itself is taken over from the process.
         found = replace(found, query_id=query.query_id, status="ok", message="")
         return replace(found, latency_s=reply.seconds, matcher_s=reply.own_s)

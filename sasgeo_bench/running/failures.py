@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
-from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.progress import tell
 from sasgeo_bench.texts import message_of, one_line
 
@@ -25,23 +25,6 @@ def stops_all(error: BaseException | None) -> bool:
             return True
         error = error.__cause__
     return False
-
-
-def guard(ask: Callable[[], Item], failed: Callable[[Exception], Item]) -> Item:
-    """Return the reply to a question; an error counts as one, unless our own disk or folders are at fault.
-
-    `failed` makes a reply of an error. Raise `StoreError` if the disk is at fault.
-    """
-    try:
-        return ask()
-    except StoreError:
-        raise
-    except Exception as error:
-        if stops_all(error):
-            raise StoreError(
-                f"no process of a plugin can be started ({message_of(error)}): free some space and run again"
-            ) from error
-        return failed(error)
 
 
 def our_failure(log: Path, name: str, error: Exception) -> str:

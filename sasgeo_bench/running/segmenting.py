@@ -20,11 +20,10 @@ from sasgeo_bench.matching.segmenter import MOST_TEXT_BYTES, SegmenterCard, chec
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.running import wire
 from sasgeo_bench.running.answers import Patience
-from sasgeo_bench.running.failures import LOG, guard, our_failure
 from sasgeo_bench.running.oracle import ISOLATION
 from sasgeo_bench.running.plan import hidden_below, segmenter_code
 from sasgeo_bench.running.training import failed_training
-from sasgeo_bench.running.worker import Limits, PluginProcess, PluginReply, Reach, loaded_card
+from sasgeo_bench.running.worker import Limits, PluginProcess, PluginReply, Reach, guarded, loaded_card
 from sasgeo_bench.sensing.image import AerialImage, LabelledFiles, LabelledImage, image_bytes, write_labelled
 from sasgeo_bench.sensing.segmentation import CERTAIN, MOST_CLASSES, SILENT, Segmentation
 
@@ -164,7 +163,7 @@ def train_segmenter(request: SegmentRequest, images: Iterable[LabelledImage]) ->
     with _paths_of(images) as paths:
         reach = request.reach(tuple(dict.fromkeys(path.parent for path in paths)))
         with SegmenterProcess(spec=request.spec, reach=reach, limits=request.limits) as process:
-            reply = guard(partial(process.learn, paths), partial(_failed_by_us, request))
+            reply = guarded(partial(process.learn, paths), request.out, request.spec)
     return reply if reply.learned is not None else failed_training(reply)
 
 
@@ -214,7 +213,7 @@ class SegmenterRun:
         if self._patience.given_up is not None:
             return SegmenterReply(status="timeout", message=self._patience.given_up)
         ask = partial(self._process.segment, picture, classes=card.classes)
-        reply = guard(ask, partial(_failed_by_us, self._request))
+        reply = guarded(ask, self._request.out, self._request.spec)
         self._patience.note(reply.status, reply.message)
         return reply
 
@@ -227,7 +226,3 @@ class SegmenterRun:
     def peak_bytes(self) -> int:
         """Return the most memory that a process of the segmenter held."""
         return self._process.peak_bytes
-
-
-def _failed_by_us(request: SegmentRequest, error: Exception) -> SegmenterReply:
-    return SegmenterReply(status="crash", message=our_failure(request.out / LOG, request.spec, error))

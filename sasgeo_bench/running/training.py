@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train a matcher before the first query: once for each training set, in its own process, kept as a text."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -15,10 +15,9 @@ from sasgeo_bench.matching.cards import read_learned, write_learned
 from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.running.failures import LOG, guard, our_failure
 from sasgeo_bench.running.plan import RunPlan, reach_of, with_training_result
 from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
-from sasgeo_bench.running.worker import AnyCard, Found, PluginReply, Reply, Worker
+from sasgeo_bench.running.worker import AnyCard, Found, PluginReply, Reply, Worker, guarded
 from sasgeo_bench.sensing.segmentation import Segmentation, tables_of
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.texts import one_line
@@ -58,17 +57,7 @@ def _learn(plan: RunPlan, training_set: TrainingSet) -> Reply:
     pairs = read_pairs(training_set)
     reach = reach_of(request, tuple(regions.values()))
     with Worker(spec=request.spec, reach=reach, limits=request.limits) as worker:
-        return guarded(plan, partial(worker.learn, regions, pairs))
-
-
-def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
-    """Return the reply to a question; an error counts as one, unless our own disk or folders are at fault."""
-    return guard(ask, partial(failed_by_us, plan))
-
-
-def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
-    """Log the traceback of an error of our own code, and return the reply to its query."""
-    return Reply(status="crash", message=our_failure(plan.run_folder / LOG, plan.card.name, error))
+        return guarded(partial(worker.learn, regions, pairs), plan.run_folder, plan.card.name)
 
 
 def failed_training(reply: PluginReply[AnyCard, Found]) -> PluginReply[AnyCard, Found]:
@@ -101,15 +90,15 @@ def recalibrated(said: Iterable[Said], region: Region) -> Iterator[Said]:
         shares = shares_within([query.prior for query in queries], region)
         tables = tables_of(totals, {told: share for told, share in shares.items() if told in totals})
         for at, query in enumerate(queries):
-            yield query, [_read(_file(folder, at, number), tables) for number in range(len(query.frames))]
+            files = (_file(folder, at, number) for number in range(len(query.frames)))
+            yield (
+                query,
+                [Segmentation.from_bytes(one.read_bytes()).recoded(tables) if one.is_file() else None for one in files],
+            )
 
 
 def _file(folder: Path, at: int, number: int) -> Path:
     return folder / f"{at}-{number}"
-
-
-def _read(path: Path, tables: dict[str, NDArray[np.uint8]]) -> Segmentation | None:
-    return Segmentation.from_bytes(path.read_bytes()).recoded(tables) if path.is_file() else None
 
 
 def shares_within(priors: Sequence[Prior], region: Region) -> dict[str, float]:

@@ -12,7 +12,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, Ty
 
 import sasgeo_bench.running.child
 from sasgeo_bench.config import shipped_dir
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import check_card_name, import_paths
 from sasgeo_bench.matching.matcher import (
@@ -37,6 +37,7 @@ from sasgeo_bench.matching.matcher import (
 )
 from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
+from sasgeo_bench.running.failures import LOG, our_failure, stops_all
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
@@ -49,6 +50,7 @@ from sasgeo_bench.texts import (
     MOST_MESSAGE,
     MOST_S,
     is_line,
+    message_of,
     one_line,
 )
 
@@ -469,6 +471,23 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
 
     def _found(self, data: bytes) -> Prediction:
         return check_prediction(checked(ROW, data), None, top_k=MOST_CANDIDATES)
+
+
+def guarded(ask: Callable[[], PluginReply[AnyCard, Found]], folder: Path, name: str) -> PluginReply[AnyCard, Found]:
+    """Return the reply to a question; an error of our own counts as one, and is logged in a folder.
+
+    Raise `StoreError` if our own disk or folders are at fault.
+    """
+    try:
+        return ask()
+    except StoreError:
+        raise
+    except Exception as error:
+        if stops_all(error):
+            raise StoreError(
+                f"no process of a plugin can be started ({message_of(error)}): free some space and run again"
+            ) from error
+        return PluginReply(status="crash", message=our_failure(folder / LOG, name, error))
 
 
 def loaded_card(process: PluginProcess[AnyCard, Found], *, group: str, is_oracle: bool = False) -> tuple[AnyCard, bool]:

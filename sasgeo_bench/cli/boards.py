@@ -17,12 +17,19 @@ from sasgeo_bench.experiments.head_start import packed_for, unpack_head_start
 from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.board_tables import Book, contrast_table, risk_tables, summary
 from sasgeo_bench.leaderboard.manifests import SeedRecord
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
 from sasgeo_bench.leaderboard.tables import text_of
-from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, warnings_of
+from sasgeo_bench.leaderboard.text import (
+    TERMINAL,
+    Contents,
+    control_lines,
+    map_lines,
+    segmenter_lines,
+    tables_of,
+    warnings_of,
+)
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.archive_file import is_pack
@@ -291,15 +298,14 @@ def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) 
 
 def show_board(board: Board) -> None:
     """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
-    risks = risk_tables(board.leaderboard)
-    tables = (*summary(Book.of(board.leaderboard)), contrast_table(board.findings), *risks)
-    for table in (one for one in tables if one.rows):
+    kinds = tables_of(Contents(leaderboard=board.leaderboard, findings=board.findings), TERMINAL)
+    for table in (one for tables in kinds.values() for one in tables if one.rows):
         say(table.title)
         shown = Table(*(column.name for column in table.columns), box=None, pad_edge=False)
         for row in table.rows:
             shown.add_row(*map(text_of, row.cells))
         print_table(shown)
-    for line in dict.fromkeys(note for table in risks if table.rows for note in table.notes):
+    for line in dict.fromkeys(note for table in kinds["risk"] for note in table.notes):
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)

@@ -3,26 +3,29 @@
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.manifests import BoardEntry
-from sasgeo_bench.leaderboard.private_board import SEEDS_NOTE
+from sasgeo_bench.leaderboard.manifests import BoardEntry, SeedFigure
 from sasgeo_bench.leaderboard.tables import (
     FEW,
     Cell,
     Column,
+    Field,
     Key,
     Mark,
     Record,
     Row,
+    Shown,
     Table,
     Tie,
     column,
+    fields_of,
     figure_cell,
     file_stem,
     interval_text,
@@ -39,10 +42,10 @@ from sasgeo_bench.leaderboard.tables import (
     sort_key,
     suite_card,
     suite_words,
+    table_of,
     tally_text,
-    text_cells,
     ties_of,
-    words,
+    word,
 )
 from sasgeo_bench.scoring.compare import LEAST_PLACES, Finding
 from sasgeo_bench.scoring.contrasts import AREAS
@@ -51,6 +54,7 @@ from sasgeo_bench.scoring.decisions import PRESENT_SHARES
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, mixture_name
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
+from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, MOST_STEPS, STRESS, is_bin, is_step
 from sasgeo_bench.scoring.tables import AS_USED, SCENES
 from sasgeo_bench.tasks.query import BY, SEQUENCE
@@ -232,6 +236,13 @@ def _section(book: Book, key: Key) -> Section:
     )
 
 
+def suite_tables(book: Book) -> Iterator[Table]:
+    """Yield the tables of `sections_of` as they stand alone, each with what it counts, and those set apart."""
+    for section in sections_of(book):
+        yield replace(section.table, notes=(*filter(None, (section.context,)), *section.table.notes))
+        yield from filter(None, (section.apart,))
+
+
 def _apart(book: Book, key: Key, names: Sequence[str]) -> Table:
     table = suite_table(book, key, names)
     reasons = tuple(f"{name}: {book.entries[name].set_apart}." for name in names)
@@ -251,24 +262,42 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     ties = ties_of(list(found.values()))
     tie_of = {name: number for number, tie in enumerate(ties) for name in tie.names}
     ranked = sum(not pd.isna(row["rank_best"]) for row in found.values())
-    rows = tuple(_row(book, key, found[name], tie_of.get(name), ranked) for name in order)
-    titles = (primary, "rank", *_besides(track), "control", "false fixes", "detectable", "n", "missing", "blocks")
-    table = Table(
-        name=file_stem("board", suite, track, prior_group),
-        title=f"{suite}: {track}, {prior_words(prior_group)}",
-        columns=(
-            column("matcher", is_number=False),
-            *(column(name, order="descending" if name == primary else "none") for name in titles),
-        ),
-        rows=rows,
-        notes=_notes(book, ties, found, ranked),
+    tone = {name: "tied" if number % 2 == 0 else "other-tie" for name, number in tie_of.items()}
+    tone |= dict.fromkeys(book.controls, "control")
+    shares = Mark(text="tie", meaning="shares ranks with others, named below the table")
+
+    def figure(name: str, of: tuple[str, str]) -> Cell:
+        return figure_cell(book.pick(key, name, of[0], of[1] or str(found[name]["stratum"])))
+
+    def missing(name: str) -> Cell:
+        return plain_cell(int(found[name]["missing"])) if found[name]["missing"] else Cell(text="-", key=0.0)
+
+    def blocks(name: str) -> Cell:
+        row = found[name]
+        return Cell(text=f"{row['blocks']} in {counted(int(row['places']), 'place')}", key=float(row["blocks"]))
+
+    beside = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
+    figures = [(column(metric), (metric, "")) for metric in beside]  # of the queries that the first figure counts
+    figures += [(column("control"), (primary, CONTROL)), (column("false fixes"), (FALSE_ABSENT.name, ALL))]
+    fields: tuple[Field[str], ...] = (
+        (word("matcher"), book.name_cell),
+        (column(primary, order="descending"), lambda name: figure_cell(found[name], has_bar=True)),
+        (column("rank"), lambda name: rank_cell(found[name], ranked=ranked, mark=shares if name in tie_of else None)),
+        *fields_of(figures, figure),
+        (column("detectable"), lambda name: float(found[name]["detectable"])),
+        (column("n"), lambda name: int(found[name]["n"])),
+        (column("missing"), missing),
+        (column("blocks"), blocks),
     )
-    return table.without_empty(*_besides(track), "false fixes", "control", "detectable", "missing")
-
-
-def _besides(track: str) -> tuple[str, ...]:
-    """Return the figures that a table shows beside the primary one, of the same queries."""
-    return _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
+    table = table_of(
+        file_stem("board", suite, track, prior_group),
+        f"{suite}: {track}, {prior_words(prior_group)}",
+        order,
+        fields,
+        notes=_notes(book, ties, found, ranked),
+        tone=lambda name: tone.get(name, "plain"),
+    )
+    return table.without_empty(*beside, "false fixes", "control", "detectable", "missing")
 
 
 def _value(row: Record) -> float:
@@ -276,27 +305,8 @@ def _value(row: Record) -> float:
     return -math.inf if math.isnan(value) else value
 
 
-def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Row:
-    name, stratum = str(main["matcher"]), str(main["stratum"])
-    primary = str(main["metric"])
-    mark = None if tie is None else Mark(text="tie", meaning="shares ranks with others, named below the table")
-    tone = "control" if name in book.controls else "plain" if tie is None else ("tied" if tie % 2 == 0 else "other-tie")
-    places = counted(int(main["places"]), "place")
-    return Row(
-        cells=(
-            book.name_cell(name),
-            figure_cell(main, has_bar=True),
-            rank_cell(main, ranked=ranked, mark=mark),
-            *(figure_cell(book.pick(key, name, metric, stratum)) for metric in _besides(key[1])),
-            figure_cell(book.pick(key, name, primary, CONTROL)),
-            figure_cell(book.pick(key, name, FALSE_ABSENT.name)),
-            number_cell(float(main["detectable"])),
-            plain_cell(int(main["n"])),
-            plain_cell(int(main["missing"])) if main["missing"] else Cell(text="-", key=0.0),
-            Cell(text=f"{main['blocks']} in {places}", key=float(main["blocks"])),
-        ),
-        tone=tone,
-    )
+def _value_of(row: Record | None) -> float:
+    return math.nan if row is None else float(row["value"])
 
 
 def _notes(book: Book, ties: Sequence[Tie], found: Mapping[str, Record], ranked: int) -> tuple[str, ...]:
@@ -353,24 +363,24 @@ def _strata_table(book: Book, key: Key, names: Sequence[str], *, number: int) ->
     suite, track, prior_group = key
     primary = primary_of(track).name
     more = "" if number == 1 else f", table {number}"
-    rows = []
-    for stratum in book.strata[key]:
-        found = {name: book.pick(key, name, primary, stratum) for name in names}
-        counts = sorted({int(row["n"]) for row in found.values() if row is not None})
-        if counts:
-            first = Cell(text=stratum)
-            n = Cell(text="-".join(map(str, counts)), key=float(counts[0]))
-            most = book.pick(key, names[0], CEILING.name, stratum)
-            ceiling = number_cell(math.nan if most is None else float(most["value"]))
-            rows.append(Row(cells=(first, n, ceiling, *(figure_cell(row) for row in found.values()))))
-    meaning = column(primary).meaning
-    columns = [column(primary, title=name) for name in names]
-    return Table(
-        name=file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
-        title=f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
-        columns=(column("part", is_number=False), column("n"), column(CEILING.name), *columns),
-        rows=tuple(rows),
-        notes=(f"Cells: {primary} with its 95 % interval. {meaning}.",),
+    found = {part: [book.pick(key, name, primary, part) for name in names] for part in book.strata[key]}
+    counts = {part: sorted({int(row["n"]) for row in rows if row is not None}) for part, rows in found.items()}
+
+    def figure(part: str, at: int) -> Cell:
+        return figure_cell(found[part][at])
+
+    fields: tuple[Field[str], ...] = (
+        (word("part"), str),
+        (column("n"), lambda part: Cell(text="-".join(map(str, counts[part])), key=float(counts[part][0]))),
+        (column(CEILING.name), lambda part: _value_of(book.pick(key, names[0], CEILING.name, part))),
+        *fields_of(((column(primary, title=name), at) for at, name in enumerate(names)), figure),
+    )
+    return table_of(
+        file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
+        f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
+        [part for part in found if counts[part]],
+        fields,
+        notes=[f"Cells: {primary} with its 95 % interval. {column(primary).meaning}."],
     )
 
 
@@ -380,30 +390,23 @@ def cost_table(book: Book) -> Table:
     kinds = sorted({(SHOWN_COSTS.index(key[-1]), key[-1], key[1]) for key in found})
     by_kind = {(key[3], key[-1], key[1]): row for key, row in found.items()}
     units = {key[-1]: str(row["unit"]) for key, row in found.items()}
-    values = {
-        name: [_cost(by_kind.get((name, metric, track))) for _, metric, track in kinds]
-        for name in sorted({key[3] for key in found})
-    }
-    order = sorted(values, key=lambda name: [(math.isnan(value), value) for value in values[name][:1]])
-    rows = [Row(cells=(book.name_cell(name), *map(number_cell, values[name]))) for name in order]
+
+    def cost(name: str, of: tuple[str, str]) -> float:
+        return _value_of(by_kind.get((name, *of)))
+
+    titles = [f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})" for _, metric, track in kinds]
     columns = [
-        column(
-            metric,
-            title=f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})",
-            order="ascending" if at == 0 else "none",
-        )
-        for at, (_, metric, track) in enumerate(kinds)
+        (column(metric, title=title, order="none" if at else "ascending"), (metric, track))
+        for at, ((_, metric, track), title) in enumerate(zip(kinds, titles, strict=True))
     ]
+    firsts = {name: [cost(name, of) for _, of in columns[:1]] for name in {key[3] for key in found}}
+    order = sorted(firsts, key=lambda name: ([(math.isnan(value), value) for value in firsts[name]], name))
+    fields: tuple[Field[str], ...] = ((word("matcher"), book.name_cell), *fields_of(columns, cost))
     notes = (
         "Measured once, on the machine that made the board; 1 kB is 1000 bytes, 1 MB a million.",
         "Each was measured on the queries that it was asked: those of other suites do not compare.",
     )
-    first = column("matcher", is_number=False)
-    return Table(name="costs", title="What answers cost", columns=(first, *columns), rows=tuple(rows), notes=notes)
-
-
-def _cost(row: Record | None) -> float:
-    return math.nan if row is None else float(row["value"])
+    return table_of("costs", "What answers cost", order, fields, notes=notes)
 
 
 def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None) -> Iterator[Table]:
@@ -412,7 +415,7 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
     `steps` is from `strata.steps_frame`; `ages`, from `plots.age_names`, names steps that are ages of a map.
     """
     named = ages or {}
-    for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
+    for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True) if len(steps) else ():
         suite, track, prior_group, kind, unit = map(str, key)
         records = records_of(part)
         counts: dict[tuple[int, float], int] = {}
@@ -421,21 +424,24 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
             counts[step] = max(counts.get(step, 0), int(row["n"]))
         order = part.groupby("matcher")["value"].mean().sort_index().sort_values(ascending=False, kind="stable")
         by_step = {(row["matcher"], row["view_cells"], row["strength"]): row for row in records}
-        rows = tuple(
-            Row(cells=(Cell(text=str(name)), *(figure_cell(by_step.get((name, *step))) for step in counts)))
-            for name in order.index
-        )
-        titles = [
-            f"{named.get((suite, track, prior_group, strength, size), f'{strength:g}')}, {size} cells, n = {n}"
-            for (size, strength), n in counts.items()
+        titles = {
+            (size, strength): f"{named.get((suite, track, prior_group, strength, size), f'{strength:g}')}, {size} cells"
+            for size, strength in counts
+        }
+        columns = [
+            (column(primary_of(track).name, title=f"{titles[step]}, n = {n}"), step) for step, n in counts.items()
         ]
-        primary = primary_of(track).name
-        yield Table(
-            name=file_stem("steps", suite, track, prior_group, kind),
-            title=f"{suite}: {track}, {prior_words(prior_group)}, step by step: {kind} ({unit})",
-            columns=(*words("matcher"), *(column(primary, title=title) for title in titles)),
-            rows=rows,
+        fields: tuple[Field[str], ...] = ((word("matcher"), str), *fields_of(columns, partial(_step_cell, by_step)))
+        yield table_of(
+            file_stem("steps", suite, track, prior_group, kind),
+            f"{suite}: {track}, {prior_words(prior_group)}, step by step: {kind} ({unit})",
+            order.index,
+            fields,
         )
+
+
+def _step_cell(rows: Mapping[tuple[str, int, float], Record], name: str, step: tuple[int, float]) -> Cell:
+    return figure_cell(rows.get((name, *step)))
 
 
 AT_MOST: Final = "at most"  # the line of the ceiling
@@ -467,26 +473,33 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
     whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
     weighed = [at for at, key in enumerate(shown) if ranked[key]]  # the others have too few places
     has_mean = len(weighed) > 1 and len(whole - book.controls) > 1
-    rows = _overview_heads(book, shown, absent, primary, has_mean=has_mean)
-    for name in order:
-        cells = [short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
-        cells += [short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False) for key in absent]
-        if has_mean:
-            cells.append(number_cell(_mean_value([found[name][at] for at in weighed]) if name in whole else math.nan))
-        tone = "head" if name in book.controls else "plain"
-        rows.append(Row(cells=(book.short_name(name), *cells), tone=tone))
-    columns = (
-        *(_suite_column(book, key, primary, has_absent=key in absent) for key in shown),
-        *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
-        *([column("mean")] if has_mean else []),
+
+    def figure(name: str, key: Key) -> Cell:
+        return short_cell(by_suite[key][name], is_rivalled=ranked[key] > 1)
+
+    def false_fixes(name: str, key: Key) -> Cell:
+        return short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False)
+
+    fields: list[Field[str]] = [
+        (word("matcher"), book.short_name),
+        *fields_of(((_suite_column(book, key, primary, has_absent=key in absent), key) for key in shown), figure),
+        *fields_of(((column("false fixes", title=f"{key[0]}: false fixes"), key) for key in absent), false_fixes),
+    ]
+    if has_mean:
+        means = {
+            name: _mean_value([found[name][at] for at in weighed]) if name in whole else math.nan for name in order
+        }
+        fields.append((column("mean"), lambda name: means[name]))
+    table = table_of(
+        file_stem("summary", track, prior_group),
+        f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
+        order,
+        fields,
+        tone=lambda name: "head" if name in book.controls else "plain",
     )
-    return Table(
-        name=file_stem("summary", track, prior_group),
-        title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-        columns=(*words("matcher"), *columns),
-        rows=tuple(rows),
-        notes=tuple(_overview_notes(primary, rows, has_absent=bool(absent), has_several=len(shown) > 1)),
-    )
+    rows = (*_overview_heads(book, shown, absent, primary, has_mean=has_mean), *table.rows)
+    notes = tuple(_overview_notes(primary, rows, has_absent=bool(absent), has_several=len(shown) > 1))
+    return replace(table, rows=rows, notes=notes)
 
 
 def _order(book: Book, found: Mapping[str, Sequence[Record | None]]) -> list[str]:
@@ -544,7 +557,7 @@ def _overview_heads(
     beside = {"queries": [plain_cell(_count(book, key, FALSE_ABSENT.name)) for key in absent]}
     for title, metric in ((AT_MOST, CEILING.name), ("chance", CHANCE.name)):
         rows = [next(filter(None, (book.main(key, name, metric) for name in book.matchers[key])), None) for key in keys]
-        lines[title] = [number_cell(math.nan if row is None else float(row["value"])) for row in rows]
+        lines[title] = [number_cell(_value_of(row)) for row in rows]
     nothing = [Cell(text="-")]
     return [
         Row(
@@ -628,7 +641,12 @@ def risk_tables_by_suite(board: pd.DataFrame) -> tuple[Table, ...]:
     return tuple(table for table in found if table.rows)
 
 
-Best = Mapping[tuple[str, str], Mapping[str, Record]]  # figures by matcher and rejector, then by metric
+Pair = tuple[str, str]  # matcher and rejector
+Best = Mapping[Pair, Mapping[str, Record]]  # figures by metric
+_PAIR: Final[tuple[Field[tuple[str, ...]], ...]] = (
+    (word("matcher"), lambda pair: pair[0]),
+    (word("rejector"), lambda pair: pair[1]),
+)
 
 
 def _groups(board: pd.DataFrame, stem: str) -> Iterator[tuple[Best, pd.DataFrame, str, str]]:
@@ -651,25 +669,14 @@ def _best_pairs(part: pd.DataFrame) -> Best:
 
 
 def _risk_table(best: Best, name: str, where: str) -> Table:
-    rows = [
-        Row(
-            cells=(
-                *text_cells(*key),
-                *(figure_cell(by_name.get(metric)) for metric in (COVERED, REACHED)),
-                Cell(text=_kept(by_name.get(REACHED))),
-                plain_cell(int(by_name["aurc"]["n"])),
-            )
-        )
-        for key, by_name in best.items()
-    ]
-    figures = (column(COVERED, title="answered"), column(REACHED, title="false of these"))
-    return Table(
-        name=name,
-        title=f"Answers where 5 % of them may be false fixes: {where}",
-        columns=(*words("matcher", "rejector"), *figures, *words("risk kept"), column("n")),
-        rows=tuple(rows),
-        notes=_RISK_NOTES,
+    fields: tuple[Field[Pair], ...] = (
+        *_PAIR,
+        (column(COVERED, title="answered"), lambda pair: figure_cell(best[pair].get(COVERED))),
+        (column(REACHED, title="false of these"), lambda pair: figure_cell(best[pair].get(REACHED))),
+        (word("risk kept"), lambda pair: _kept(best[pair].get(REACHED))),
+        (column("n"), lambda pair: int(best[pair]["aurc"]["n"])),
     )
+    return table_of(name, f"Answers where 5 % of them may be false fixes: {where}", best, fields, notes=_RISK_NOTES)
 
 
 def _kept(row: Record | None) -> str:
@@ -691,20 +698,15 @@ def _risk_by_suite(best: Best, part: pd.DataFrame, name: str, where: str) -> Tab
     shares = {mixture_name(share): f"{100 * (1 - share):.0f} % of places absent" for share in PRESENT_SHARES}
     places = [(ALL_SUITES, mixture) for mixture in shares] + [(suite, AS_DRAWN) for suite in suites]
     keys = zip(*(reached[field] for field in ("matcher", "rejector", "suite", "stratum")), strict=True)
-    by_key: dict[tuple[Any, ...], Any] = dict(zip(keys, reached.to_dict("records"), strict=True))
-    titles = [*(shares[mixture] for mixture in shares), *suites]
-    return Table(
-        name=name,
-        title=f"How many of these are false, by share of absent places and by suite: {where}",
-        columns=(*words("matcher", "rejector"), *(column(REACHED, title=title) for title in titles)),
-        rows=tuple(
-            Row(
-                cells=(*text_cells(*key), *(short_cell(by_key.get((*key, *place)), has_rank=False) for place in places))
-            )
-            for key in best
-        ),
-        notes=_BY_SUITE_NOTES,
-    )
+    by_key: dict[tuple[str, ...], Record] = dict(zip(keys, records_of(reached), strict=True))
+    columns = [(column(REACHED, title=shares.get(part, suite)), (suite, part)) for suite, part in places]
+
+    def reached_there(pair: Pair, place: tuple[str, str]) -> Cell:
+        return short_cell(by_key.get((*pair, *place)), has_rank=False)
+
+    fields: tuple[Field[Pair], ...] = (*_PAIR, *fields_of(columns, reached_there))
+    title = f"How many of these are false, by share of absent places and by suite: {where}"
+    return table_of(name, title, best, fields, notes=_BY_SUITE_NOTES)
 
 
 def _by_metric(part: pd.DataFrame) -> dict[str, Record]:
@@ -734,27 +736,29 @@ def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: 
 
     `has_queries` adds a column of the track and prior group of each line.
     """
-    rows = []
-    for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
-        matcher, rejector, track, prior_group = map(str, key)
-        by_name = _by_metric(mine)
-        queries = text_cells(f"{track}, {prior_group}") if has_queries else ()
-        figures = [figure_cell(by_name.get(metric)) for metric in _REJECTION]
-        cells = (*text_cells(matcher, rejector), *queries, *figures, plain_cell(int(mine["n"].iloc[0])))
-        is_control = is_unranked(matcher)
-        row = Row(cells=cells, tone="control" if is_control else "plain")
-        rows.append((is_control, _area(by_name), matcher, rejector, row))
-    rows.sort(key=lambda row: row[:4])
-    return Table(
-        name=name,
-        title=title,
-        columns=(
-            *words("matcher", "rejector"),
-            *(words("queries") if has_queries else ()),
-            *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")),
-        ),
-        rows=tuple(row for *_, row in rows),
+    found = {
+        tuple(map(str, key)): _by_metric(mine)
+        for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True)
+    }
+    controls = {key for key in found if is_unranked(key[0])}
+
+    def figure(key: tuple[str, ...], metric: str) -> Cell:
+        return figure_cell(found[key].get(metric))
+
+    metrics = ((column(metric, order="ascending" if metric == "aurc" else "none"), metric) for metric in _REJECTION)
+    fields: list[Field[tuple[str, ...]]] = [
+        *_PAIR,
+        *([(word("queries"), lambda key: f"{key[2]}, {key[3]}")] if has_queries else []),
+        *fields_of(metrics, figure),
+        (column("n"), lambda key: int(next(iter(found[key].values()))["n"])),
+    ]
+    return table_of(
+        name,
+        title,
+        sorted(found, key=lambda key: (key in controls, _area(found[key]), key)),
+        fields,
         notes=("ECE and costs have no interval on this board: they decide nothing.",),
+        tone=lambda key: "control" if key in controls else "plain",
     )
 
 
@@ -774,41 +778,71 @@ def acceptance_tables(acceptance: pd.DataFrame) -> tuple[Table, ...]:
 
 def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
     """Return risk and coverage, who has the least risk over all absences first, and an absence a line."""
-    rows: dict[tuple[str, ...], Row] = {}
-    risks: dict[tuple[str, ...], float] = {}
-    for names, mine in part.groupby(["matcher", "rejector", "absence"], sort=True):
-        key = tuple(map(str, names))
-        by_mixture = {str(row["mixture"]): row for row in records_of(mine)}
-        some = next(iter(by_mixture.values()))
-        absent = plain_cell(int(some["absent"]))
-        cells = [_cell(by_mixture.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")]
-        rows[key] = Row(cells=(*text_cells(*key), absent, *cells))
-        if AS_DRAWN in by_mixture and not math.isnan(by_mixture[AS_DRAWN]["risk"]):
-            risks[key] = float(by_mixture[AS_DRAWN]["risk"])
-    order = sorted(rows, key=lambda key: (risks.get((*key[:2], "all"), math.inf), key))
-    titles = [
-        (term, f"{term.split()[0]}, {mixture if mixture == AS_DRAWN else f'{100 * (1 - share):.0f} % absent'}")
-        for mixture, share in zip(_MIXTURES, (math.nan, *PRESENT_SHARES), strict=True)
-        for term in ("risk of fixes", "coverage")
+    found = {
+        tuple(map(str, key)): {str(row["mixture"]): row for row in records_of(mine)}
+        for key, mine in part.groupby(["matcher", "rejector", "absence"], sort=True)
+    }
+    risks = {key: float(rows[AS_DRAWN]["risk"]) for key, rows in found.items() if AS_DRAWN in rows}
+    whole = {key[:2]: risk for key, risk in risks.items() if key[2] == "all" and not math.isnan(risk)}
+
+    def share(key: tuple[str, ...], of: tuple[str, str]) -> Cell:
+        return share_cell(found[key].get(of[0]), of[1])
+
+    shares = [AS_DRAWN, *(f"{100 * (1 - share):.0f} % absent" for share in PRESENT_SHARES)]
+    columns = [
+        (column(term, title=f"{name}, {share}"), (mixture, name))
+        for mixture, share in zip(_MIXTURES, shares, strict=True)
+        for term, name in (("risk of fixes", "risk"), ("coverage", "coverage"))
     ]
-    return Table(
-        name=file_stem("acceptance", track, prior_group),
-        title=f"Risk and coverage by kind of absence: {track}, {prior_words(prior_group)}",
-        columns=(
-            *words("matcher", "rejector", "absence"),
-            column("absent"),
-            *(column(term, title=title) for term, title in titles),
-        ),
-        rows=tuple(rows[key] for key in order),
+    fields: tuple[Field[tuple[str, ...]], ...] = (
+        *_PAIR,
+        (word("absence"), lambda key: key[2]),
+        (column("absent"), lambda key: int(next(iter(found[key].values()))["absent"])),
+        *fields_of(columns, share),
+    )
+    return table_of(
+        file_stem("acceptance", track, prior_group),
+        f"Risk and coverage by kind of absence: {track}, {prior_words(prior_group)}",
+        sorted(found, key=lambda key: (whole.get(key[:2], math.inf), key)),
+        fields,
         notes=(f"Fixes accepted by Eq. 14 at costs of {SHOWN_RATIO:g} to 1; acceptance.parquet holds other costs.",),
     )
 
 
-def _cell(row: Mapping[Any, Any] | None, name: str) -> Cell:
+def share_cell(row: Record | None, name: str) -> Cell:
+    """Return a cell of a share of a table whose ends have its name, as in `risk`, `risk_lo`, `risk_hi`."""
     if row is None:
         return figure_cell(None)
     value, lo, hi = (float(row[f"{name}{end}"]) for end in ("", "_lo", "_hi"))
     return figure_cell({"value": value, "lo": lo, "hi": hi, "unit": "1", "interval": "", "is_applicable": True})
+
+
+_AREAS: Final = ("available", "misleading", "hazardous", "exceeded")
+
+
+def protection_tables(protection: pd.DataFrame) -> Iterator[Table]:
+    """Yield the results of protection levels at one alert limit, a table for each prior group."""
+    limits = sorted(set(protection["alert_limit_m"])) if len(protection) else ()
+    shown_m = FIX_M if FIX_M in limits else next(iter(limits), FIX_M)
+    others = " and ".join(f"{limit:g}" for limit in limits if limit != shown_m)
+    fields: tuple[Field[Record], ...] = (
+        (word("matcher"), lambda row: str(row["matcher"])),
+        (word("method"), lambda row: str(row["method"])),
+        (column("risk", order="ascending"), lambda row: float(row["risk"])),
+        *fields_of(((column(area), area) for area in _AREAS), share_cell),
+        (column("n"), lambda row: int(row["n"])),
+        (word("supports"), lambda row: str(row["supports"])),
+    )
+    shown = protection[protection["alert_limit_m"] == shown_m] if limits else protection
+    for prior_group, part in shown.groupby("prior_group", sort=True) if limits else ():
+        order = part.sort_values(["risk", "available", "matcher", "method"], ascending=[True, False, True, True])
+        yield table_of(
+            file_stem("protection", str(prior_group)),
+            f"Alert limit {shown_m:g} m, {prior_words(str(prior_group))}",
+            records_of(order),
+            fields,
+            notes=[f"Alert limits of {others} m: protection.parquet holds them."] if others else (),
+        )
 
 
 _Found = Mapping[str, Mapping[str, Record]]  # kind of place -> matcher -> row
@@ -820,7 +854,8 @@ def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
     Those of most places come first. The first two lines count places and queries. Kinds with too few places to rank
     anybody are marked.
     """
-    groups = sorted(scenes.groupby(list(GROUP)), key=lambda group: (-int(group[1]["places"].max()), group[0]))
+    parts = scenes.groupby(list(GROUP)) if len(scenes) else ()
+    groups = sorted(parts, key=lambda group: (-int(group[1]["places"].max()), group[0]))
     for key, part in groups:
         found: dict[str, dict[str, Record]] = {}
         for row in records_of(part):
@@ -833,27 +868,21 @@ def _table(key: Key, found: _Found, book: Book) -> Table:
     use = AS_USED[suite.partition(BY)[0]]
     kinds = [kind for kind in (ALL, *SCENES) if kind in found]
     primary = str(next(iter(found[ALL].values()))["metric"])
-    order = sorted(found[ALL], key=lambda name: (-_scene_value(found[ALL][name]), name))
-    rows = [
-        Row(
-            cells=(
-                book.short_name(name),
-                *(short_cell(found[kind].get(name), is_rivalled=len(order) > 1) for kind in kinds),
-            )
-        )
-        for name in order
-    ]
-    return Table(
-        name=file_stem("kinds", suite, track, prior_group),
-        title=f"With {use.words} ({suite}): {primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-        columns=(*words("matcher"), *(_column(kind, primary) for kind in kinds)),
-        rows=(*_scene_heads(found, kinds), *rows),
-        notes=tuple(_scene_notes(suite, use.strength)),
+    order = sorted(found[ALL], key=lambda name: (-_value(found[ALL][name]), name))
+
+    def figure(name: str, kind: str) -> Cell:
+        return short_cell(found[kind].get(name), is_rivalled=len(order) > 1)
+
+    columns = ((_column(kind, primary), kind) for kind in kinds)
+    fields: tuple[Field[str], ...] = ((word("matcher"), book.short_name), *fields_of(columns, figure))
+    table = table_of(
+        file_stem("kinds", suite, track, prior_group),
+        f"With {use.words} ({suite}): {primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
+        order,
+        fields,
+        notes=_scene_notes(suite, use.strength),
     )
-
-
-def _scene_value(row: Record) -> float:
-    return -math.inf if math.isnan(row["value"]) else float(row["value"])
+    return replace(table, rows=(*_scene_heads(found, kinds), *table.rows))
 
 
 def _column(kind: str, primary: str) -> Column:
@@ -884,6 +913,12 @@ _CONTROLS_NOTE: Final = (
     "The right score of these queries is known beforehand. At chance: views of a shuffled map, of a map turned by "
     "half, and of one of two places that are the same."
 )
+_SEEDS_NOTE: Final = (
+    "The same matchers, by version and hash, on the same pipeline drawn by a private seed. The sites differ, so no "
+    "query pairs with another: draws resample blocks of ground with the queries of both seeds that lie in them. All "
+    "intervals of a matcher hold at once (95 %). Shown are the figures over all suites, and whatever is worse on the "
+    "private seed."
+)
 _FALSIFIERS_NOTE: Final = (
     "The entries of each contrast where the difference between them is taken away: at the same places without the "
     "stress (`control`), and on the falsifiers of each suite. A gain here as well is not caused by what the contrast "
@@ -891,59 +926,34 @@ _FALSIFIERS_NOTE: Final = (
 )
 
 
-def seed_table(entries: Sequence[BoardEntry]) -> Table | None:
+def seed_table(entries: Sequence[BoardEntry]) -> Table:
     """Return figures on the public and on a private seed: of all suites, and whatever is shown to be worse.
 
-    None where no row was compared with a private seed.
+    No rows where none was compared with a private seed.
     """
-    rows = [
-        Row(
-            cells=text_cells(
-                entry.name,
-                item.suite,
-                item.track,
-                item.metric,
-                number_text(item.public),
-                number_text(item.private),
-                interval_text(item.difference, item.lo, item.hi),
-                f"{item.n_public} and {item.n_private}",
-                f"{item.blocks_public} and {item.blocks_private}, {item.blocks_shared} in both",
-                "worse" if item.is_worse else "not shown to be worse",
-            )
-        )
+    shown = [
+        (entry.name, item)
         for entry in entries
         for item in (() if entry.private is None else entry.private.figures)
         if item.suite == ALL_SUITES or item.is_worse
     ]
-    if not rows:
-        return None
-    numbers = tuple(map(column, ("public", "private", "private less public", "n", "blocks")))
-    columns = (*words("matcher", "suite", "track", "figure"), *numbers, *words("shown"))
-    title = "Public and private seed"
-    return Table(name="seeds", title=title, columns=columns, rows=tuple(rows), notes=(SEEDS_NOTE,))
-
-
-def control_table(verdicts: Sequence[Verdict]) -> Table | None:
-    """Return every control of every matcher; None where none was drawn."""
-    if not verdicts:
-        return None
-    rows = tuple(
-        Row(
-            cells=(
-                *text_cells(item.control, item.matcher),
-                plain_cell(item.n),
-                Cell(text=tally_text(item.found), key=item.found),
-                Cell(text=tally_text(item.expected), key=item.expected),
-                p_cell(item.p),
-                _limit_cell(item),
-                Cell(text="held" if item.holds else "FAILED"),
-            )
-        )
-        for item in verdicts
+    fields: tuple[Field[tuple[str, SeedFigure]], ...] = (
+        (word("matcher"), lambda one: one[0]),
+        (word("suite"), lambda one: one[1].suite),
+        (word("track"), lambda one: one[1].track),
+        (word("figure"), lambda one: one[1].metric),
+        (column("public"), lambda one: number_text(one[1].public)),
+        (column("private"), lambda one: number_text(one[1].private)),
+        (column("private less public"), lambda one: interval_text(one[1].difference, one[1].lo, one[1].hi)),
+        (column("n"), lambda one: f"{one[1].n_public} and {one[1].n_private}"),
+        (column("blocks"), lambda one: _blocks_text(one[1])),
+        (word("shown"), lambda one: "worse" if one[1].is_worse else "not shown to be worse"),
     )
-    first = column("control query", is_number=False, title="control")
-    columns = (first, *words("matcher"), *map(column, ("n", "found", "expected", "p", "fails at")), *words("outcome"))
-    return Table(name="controls", title="Controls, one by one", columns=columns, rows=rows, notes=(_CONTROLS_NOTE,))
+    return table_of("seeds", "Public and private seed", shown, fields, notes=(_SEEDS_NOTE,))
+
+
+def _blocks_text(item: SeedFigure) -> str:
+    return f"{item.blocks_public} and {item.blocks_private}, {item.blocks_shared} in both"
 
 
 def _limit_cell(verdict: Verdict) -> Cell:
@@ -954,61 +964,78 @@ def _limit_cell(verdict: Verdict) -> Cell:
     return Cell(text="never") if limit is None else plain_cell(limit)
 
 
+_OF_CONTROLS: Final[tuple[Field[Verdict], ...]] = (
+    (word("control query", title="control"), lambda item: item.control),
+    (word("matcher"), lambda item: item.matcher),
+    (column("n"), lambda item: item.n),
+    (column("found"), lambda item: Cell(text=tally_text(item.found), key=item.found)),
+    (column("expected"), lambda item: Cell(text=tally_text(item.expected), key=item.expected)),
+    (column("p"), lambda item: p_cell(item.p)),
+    (column("fails at"), _limit_cell),
+    (word("outcome"), lambda item: "held" if item.holds else "FAILED"),
+)
+
+
+def control_table(verdicts: Sequence[Verdict]) -> Table:
+    """Return every control of every matcher."""
+    return table_of("controls", "Controls, one by one", verdicts, _OF_CONTROLS, notes=(_CONTROLS_NOTE,))
+
+
+def _side(name: str, value: float) -> Cell:
+    return Cell(text=f"{name}: {number_text(value)}", key=sort_key(value))
+
+
+_SIDES: Final[tuple[Field[Finding], ...]] = (
+    (column("first"), lambda item: _side(item.first, item.first_value)),
+    (column("second"), lambda item: _side(item.second, item.second_value)),
+    (
+        column("difference"),
+        lambda item: Cell(text=interval_text(item.difference, item.lo, item.hi), key=sort_key(item.difference)),
+    ),
+)
+_BY_COUNTRIES: Final = "by countries"
+_OF_CONTRASTS: Final[tuple[Field[Finding], ...]] = (
+    (word("contrast"), lambda item: item.name),
+    *_SIDES,
+    (column("by blocks"), lambda item: _ends_text(item.lo_blocks, item.hi_blocks)),
+    (column(_BY_COUNTRIES), lambda item: _ends_text(item.lo_countries, item.hi_countries)),
+    (column("attainable"), lambda item: item.attainable),
+    (column("matters"), lambda item: item.least),
+    (column("p (Holm)"), lambda item: p_cell(item.p_holm)),
+    (column("discordant"), lambda item: "-" if item.metric in AREAS else _discordant_text(item)),
+    (column("detectable"), lambda item: item.detectable),
+    (column("n"), lambda item: Cell(text=_counts_text(item), key=float(item.n))),
+    (word("verdict"), lambda item: item.verdict),
+)
+
+
+def _of_finding(item: Falsifier, shown: Callable[[Finding], Shown]) -> Shown:
+    return shown(item.finding)
+
+
+_OF_FALSIFIERS: Final[tuple[Field[Falsifier], ...]] = (
+    (word("contrast"), lambda item: item.contrast),
+    (word("suite"), lambda item: item.suite),
+    (word("kind"), lambda item: item.kind),
+    *fields_of(_SIDES, _of_finding),
+    (column("discordant"), lambda item: _discordant_text(item.finding)),
+    (column("n"), lambda item: Cell(text=_counts_text(item.finding), key=float(item.finding.n))),
+    (word("verdict"), lambda item: item.verdict),
+)
+
+
 def contrast_table(findings: Sequence[Finding]) -> Table:
     """Return the registered contrasts; intervals by countries where places share some."""
-    has_countries = any(not math.isnan(item.lo_countries) for item in findings)
-    rows = tuple(
-        Row(
-            cells=(
-                Cell(text=item.name),
-                *_sides(item),
-                Cell(text=_ends_text(item.lo_blocks, item.hi_blocks)),
-                *((Cell(text=_ends_text(item.lo_countries, item.hi_countries)),) if has_countries else ()),
-                number_cell(item.attainable),
-                number_cell(item.least),
-                p_cell(item.p_holm),
-                Cell(text="-" if item.metric in AREAS else f"{item.first_only} and {item.second_only}"),
-                number_cell(item.detectable),
-                Cell(text=_counts_text(item), key=float(item.n)),
-                Cell(text=item.verdict),
-            )
-        )
-        for item in findings
-    )
-    names = (
-        *("first", "second", "difference", "by blocks", *(("by countries",) if has_countries else ())),
-        *("attainable", "matters", "p (Holm)", "discordant", "detectable", "n"),
-    )
-    columns = (*words("contrast"), *map(column, names), *words("verdict"))
-    return Table(name="contrasts", title="Registered contrasts", columns=columns, rows=rows)
+    return table_of("contrasts", "Registered contrasts", findings, _OF_CONTRASTS).without_empty(_BY_COUNTRIES)
 
 
 def falsifier_table(found: Sequence[Falsifier]) -> Table:
     """Return the entries of each contrast where they should not differ."""
-    rows = tuple(
-        Row(
-            cells=(
-                *text_cells(item.contrast, item.suite, item.kind),
-                *_sides(item.finding),
-                Cell(text=f"{item.finding.first_only} and {item.finding.second_only}"),
-                Cell(text=_counts_text(item.finding), key=float(item.finding.n)),
-                Cell(text=item.verdict),
-            )
-        )
-        for item in found
-    )
-    numbers = tuple(map(column, ("first", "second", "difference", "discordant", "n")))
-    columns = (*words("contrast", "suite", "kind"), *numbers, *words("verdict"))
-    return Table(name="falsifiers", title="Falsifiers", columns=columns, rows=rows, notes=(_FALSIFIERS_NOTE,))
+    return table_of("falsifiers", "Falsifiers", found, _OF_FALSIFIERS, notes=(_FALSIFIERS_NOTE,))
 
 
-def _sides(item: Finding) -> tuple[Cell, ...]:
-    """Return what both entries of a contrast reach, and their difference."""
-    return (
-        Cell(text=f"{item.first}: {number_text(item.first_value)}", key=sort_key(item.first_value)),
-        Cell(text=f"{item.second}: {number_text(item.second_value)}", key=sort_key(item.second_value)),
-        Cell(text=interval_text(item.difference, item.lo, item.hi), key=sort_key(item.difference)),
-    )
+def _discordant_text(item: Finding) -> str:
+    return f"{item.first_only} and {item.second_only}"
 
 
 def _ends_text(lo: float, hi: float) -> str:

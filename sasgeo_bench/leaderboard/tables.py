@@ -3,9 +3,10 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Self
+from functools import partial
+from typing import Any, Final, Self, TypeVar
 
 import pandas as pd
 
@@ -188,11 +189,6 @@ def sort_key(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def text_cells(*texts: str) -> tuple[Cell, ...]:
-    """Return cells of plain text."""
-    return tuple(Cell(text=str(text)) for text in texts)
-
-
 def plain_cell(value: object) -> Cell:
     """Return a cell of a text or a whole number; "-" where there is none.
 
@@ -212,6 +208,45 @@ def number_cell(value: float, unit: str = "") -> Cell:
     if math.isnan(value):
         return Cell(text="-")
     return Cell(text=f"{number_text(value)} {unit}".strip(), key=value)
+
+
+Shown = Cell | str | int | float | None
+T = TypeVar("T")
+K = TypeVar("K")
+Field = tuple[Column, Callable[[T], Shown]]  # a column, and what it shows of the thing that a line is of
+
+
+def cell_of(value: Shown) -> Cell:
+    """Return what a column shows as a cell.
+
+    >>> [cell_of(value).text for value in ("mine", 3, 0.25, math.nan, None)]
+    ['mine', '3', '0.250', '-', '-']
+    """
+    if isinstance(value, Cell):
+        return value
+    if isinstance(value, str):
+        return Cell(text=value)
+    return number_cell(value) if isinstance(value, float) else plain_cell(value)
+
+
+def fields_of(columns: Iterable[tuple[Column, K]], shown: Callable[[T, K], Shown]) -> tuple[Field[T], ...]:
+    """Return columns of one kind, each with a key; `shown` says what is shown of a thing by that key."""
+    return tuple((column, lambda one, key=key: shown(one, key)) for column, key in columns)
+
+
+def table_of(
+    name: str,
+    title: str,
+    things: Iterable[T],
+    fields: Sequence[Field[T]],
+    *,
+    notes: Iterable[str] = (),
+    tone: Callable[[T], str] = lambda _: "plain",
+) -> Table:
+    """Return a table of some things, one a line; each of `fields` is a column, with what it shows of a thing."""
+    rows = (Row(cells=tuple(cell_of(shown(one)) for _, shown in fields), tone=tone(one)) for one in things)
+    columns = tuple(column for column, _ in fields)
+    return Table(name=name, title=title, columns=columns, rows=tuple(rows), notes=tuple(notes))
 
 
 def p_text(p: float) -> str:
@@ -442,13 +477,7 @@ def column(term: str, *, is_number: bool = True, order: str = "none", title: str
     return Column(term=term, name=title or term, meaning=meaning, is_number=is_number, order=order)
 
 
-def words(*terms: str) -> tuple[Column, ...]:
-    """Return columns of text.
-
-    >>> [one.is_number for one in words("matcher", "suite")]
-    [False, False]
-    """
-    return tuple(column(term, is_number=False) for term in terms)
+word: Final = partial(column, is_number=False)  # a column of text
 
 
 def prior_words(name: str) -> str:

@@ -5,7 +5,6 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final, Self
 
 import pandas as pd
@@ -25,9 +24,9 @@ from sasgeo_bench.leaderboard.tables import (
     Table,
     Tie,
     column,
-    fields_of,
     figure_cell,
     file_stem,
+    grid_of,
     interval_text,
     marks_of,
     number_cell,
@@ -258,46 +257,42 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     suite, track, prior_group = key
     primary = primary_of(track).name
     found = {name: row for name in names if (row := book.main(key, name, primary)) is not None}
-    order = sorted(found, key=lambda name: (-_value(found[name]), name))
     ties = ties_of(list(found.values()))
     tie_of = {name: number for number, tie in enumerate(ties) for name in tie.names}
     ranked = sum(not pd.isna(row["rank_best"]) for row in found.values())
     tone = {name: "tied" if number % 2 == 0 else "other-tie" for name, number in tie_of.items()}
     tone |= dict.fromkeys(book.controls, "control")
     shares = Mark(text="tie", meaning="shares ranks with others, named below the table")
+    beside = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)  # of the same queries as the first figure
 
-    def figure(name: str, of: tuple[str, str]) -> Cell:
-        return figure_cell(book.pick(key, name, of[0], of[1] or str(found[name]["stratum"])))
+    def _figure(metric: str, stratum: str = "") -> Callable[[Record], Cell]:
+        return lambda row: figure_cell(book.pick(key, row["matcher"], metric, stratum or row["stratum"]))
 
-    def missing(name: str) -> Cell:
-        return plain_cell(int(found[name]["missing"])) if found[name]["missing"] else Cell(text="-", key=0.0)
-
-    def blocks(name: str) -> Cell:
-        row = found[name]
-        return Cell(text=f"{row['blocks']} in {counted(int(row['places']), 'place')}", key=float(row["blocks"]))
-
-    beside = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
-    figures = [(column(metric), (metric, "")) for metric in beside]  # of the queries that the first figure counts
-    figures += [(column("control"), (primary, CONTROL)), (column("false fixes"), (FALSE_ABSENT.name, ALL))]
-    fields: tuple[Field[str], ...] = (
-        (word("matcher"), book.name_cell),
-        (column(primary, order="descending"), lambda name: figure_cell(found[name], has_bar=True)),
-        (column("rank"), lambda name: rank_cell(found[name], ranked=ranked, mark=shares if name in tie_of else None)),
-        *fields_of(figures, figure),
-        (column("detectable"), lambda name: float(found[name]["detectable"])),
-        (column("n"), lambda name: int(found[name]["n"])),
-        (column("missing"), missing),
-        (column("blocks"), blocks),
+    fields: tuple[Field[Record], ...] = (
+        (word("matcher"), lambda row: book.name_cell(row["matcher"])),
+        (column(primary, order="descending"), lambda row: figure_cell(row, has_bar=True)),
+        (column("rank"), lambda row: rank_cell(row, ranked=ranked, mark=shares if row["matcher"] in tie_of else None)),
+        *((column(metric), _figure(metric)) for metric in beside),
+        (column("control"), _figure(primary, CONTROL)),
+        (column("false fixes"), _figure(FALSE_ABSENT.name, ALL)),
+        (column("detectable"), lambda row: float(row["detectable"])),
+        (column("n"), lambda row: int(row["n"])),
+        (column("missing"), lambda row: int(row["missing"]) or Cell(text="-", key=0.0)),
+        (column("blocks"), _blocks_cell),
     )
     table = table_of(
         file_stem("board", suite, track, prior_group),
         f"{suite}: {track}, {prior_words(prior_group)}",
-        order,
+        sorted(found.values(), key=lambda row: (-_value(row), row["matcher"])),
         fields,
         notes=_notes(book, ties, found, ranked),
-        tone=lambda name: tone.get(name, "plain"),
+        tone=lambda row: tone.get(row["matcher"], "plain"),
     )
     return table.without_empty(*beside, "false fixes", "control", "detectable", "missing")
+
+
+def _blocks_cell(row: Record) -> Cell:
+    return Cell(text=f"{row['blocks']} in {counted(int(row['places']), 'place')}", key=float(row["blocks"]))
 
 
 def _value(row: Record) -> float:
@@ -354,34 +349,26 @@ def _attainable(book: Book, key: Key) -> str:
 
 def strata_tables(book: Book, key: Key) -> Iterator[Table]:
     """Yield the primary figure of each part of a suite, a matcher a column, in tables that a screen holds."""
-    names = book.matchers[key]
-    for first in range(0, len(names), MOST_COLUMNS):
-        yield _strata_table(book, key, names[first : first + MOST_COLUMNS], number=first // MOST_COLUMNS + 1)
-
-
-def _strata_table(book: Book, key: Key, names: Sequence[str], *, number: int) -> Table:
     suite, track, prior_group = key
     primary = primary_of(track).name
-    more = "" if number == 1 else f", table {number}"
-    found = {part: [book.pick(key, name, primary, part) for name in names] for part in book.strata[key]}
-    counts = {part: sorted({int(row["n"]) for row in rows if row is not None}) for part, rows in found.items()}
-
-    def figure(part: str, at: int) -> Cell:
-        return figure_cell(found[part][at])
-
-    fields: tuple[Field[str], ...] = (
-        (word("part"), str),
-        (column("n"), lambda part: Cell(text="-".join(map(str, counts[part])), key=float(counts[part][0]))),
-        (column(CEILING.name), lambda part: _value_of(book.pick(key, names[0], CEILING.name, part))),
-        *fields_of(((column(primary, title=name), at) for at, name in enumerate(names)), figure),
-    )
-    return table_of(
-        file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
-        f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
-        [part for part in found if counts[part]],
-        fields,
-        notes=[f"Cells: {primary} with its 95 % interval. {column(primary).meaning}."],
-    )
+    for number, first in enumerate(range(0, len(book.matchers[key]), MOST_COLUMNS), start=1):
+        names = book.matchers[key][first : first + MOST_COLUMNS]
+        lines: list[Sequence[Shown]] = []
+        for part in book.strata[key]:
+            rows = [book.pick(key, name, primary, part) for name in names]
+            counts = sorted({int(row["n"]) for row in rows if row is not None})
+            if counts:
+                n = Cell(text="-".join(map(str, counts)), key=float(counts[0]))
+                ceiling = _value_of(book.pick(key, names[0], CEILING.name, part))
+                lines.append((part, n, ceiling, *map(figure_cell, rows)))
+        more = ("", "") if number == 1 else (str(number), f", table {number}")
+        yield grid_of(
+            file_stem("strata", suite, track, prior_group, more[0]),
+            f"{primary} by stratum: {track}, {prior_words(prior_group)}{more[1]}",
+            (word("part"), column("n"), column(CEILING.name), *(column(primary, title=name) for name in names)),
+            lines,
+            notes=[f"Cells: {primary} with its 95 % interval. {column(primary).meaning}."],
+        )
 
 
 def cost_table(book: Book) -> Table:
@@ -390,23 +377,25 @@ def cost_table(book: Book) -> Table:
     kinds = sorted({(SHOWN_COSTS.index(key[-1]), key[-1], key[1]) for key in found})
     by_kind = {(key[3], key[-1], key[1]): row for key, row in found.items()}
     units = {key[-1]: str(row["unit"]) for key, row in found.items()}
-
-    def cost(name: str, of: tuple[str, str]) -> float:
-        return _value_of(by_kind.get((name, *of)))
-
-    titles = [f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})" for _, metric, track in kinds]
+    values = {
+        name: [_value_of(by_kind.get((name, metric, track))) for _, metric, track in kinds]
+        for name in sorted({key[3] for key in found})
+    }
+    order = sorted(values, key=lambda name: [(math.isnan(value), value) for value in values[name][:1]])
     columns = [
-        (column(metric, title=title, order="none" if at else "ascending"), (metric, track))
-        for at, ((_, metric, track), title) in enumerate(zip(kinds, titles, strict=True))
+        column(
+            metric,
+            title=f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})",
+            order="none" if at else "ascending",
+        )
+        for at, (_, metric, track) in enumerate(kinds)
     ]
-    firsts = {name: [cost(name, of) for _, of in columns[:1]] for name in {key[3] for key in found}}
-    order = sorted(firsts, key=lambda name: ([(math.isnan(value), value) for value in firsts[name]], name))
-    fields: tuple[Field[str], ...] = ((word("matcher"), book.name_cell), *fields_of(columns, cost))
     notes = (
         "Measured once, on the machine that made the board; 1 kB is 1000 bytes, 1 MB a million.",
         "Each was measured on the queries that it was asked: those of other suites do not compare.",
     )
-    return table_of("costs", "What answers cost", order, fields, notes=notes)
+    lines: list[tuple[Shown, ...]] = [(book.name_cell(name), *values[name]) for name in order]
+    return grid_of("costs", "What answers cost", (word("matcher"), *columns), lines, notes=notes)
 
 
 def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None) -> Iterator[Table]:
@@ -424,24 +413,16 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
             counts[step] = max(counts.get(step, 0), int(row["n"]))
         order = part.groupby("matcher")["value"].mean().sort_index().sort_values(ascending=False, kind="stable")
         by_step = {(row["matcher"], row["view_cells"], row["strength"]): row for row in records}
-        titles = {
-            (size, strength): f"{named.get((suite, track, prior_group, strength, size), f'{strength:g}')}, {size} cells"
-            for size, strength in counts
-        }
-        columns = [
-            (column(primary_of(track).name, title=f"{titles[step]}, n = {n}"), step) for step, n in counts.items()
+        titles = [
+            f"{named.get((suite, track, prior_group, strength, size), f'{strength:g}')}, {size} cells, n = {n}"
+            for (size, strength), n in counts.items()
         ]
-        fields: tuple[Field[str], ...] = ((word("matcher"), str), *fields_of(columns, partial(_step_cell, by_step)))
-        yield table_of(
+        yield grid_of(
             file_stem("steps", suite, track, prior_group, kind),
             f"{suite}: {track}, {prior_words(prior_group)}, step by step: {kind} ({unit})",
-            order.index,
-            fields,
+            (word("matcher"), *(column(primary_of(track).name, title=title) for title in titles)),
+            [(name, *(figure_cell(by_step.get((name, *step))) for step in counts)) for name in order.index],
         )
-
-
-def _step_cell(rows: Mapping[tuple[str, int, float], Record], name: str, step: tuple[int, float]) -> Cell:
-    return figure_cell(rows.get((name, *step)))
 
 
 AT_MOST: Final = "at most"  # the line of the ceiling
@@ -454,13 +435,12 @@ def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
     queries count, what can be reached and what guessing and the controls reach. Suites with more ranked matchers come
     first, so do matchers that were asked about more of them. A cell leads where its rank may be the first of several.
     """
-    keys = [key for key in book.matchers if not suites or key[0] in suites]
-    for group in sorted({key[1:] for key in keys}):
-        yield _overview(book, [key for key in keys if key[1:] == group])
+    asked = [key for key in book.matchers if not suites or key[0] in suites]
+    for group in sorted({key[1:] for key in asked}):
+        yield _overview(book, [key for key in asked if key[1:] == group])
 
 
 def _overview(book: Book, keys: Sequence[Key]) -> Table:
-    """Return the table of the suites of one track and prior group."""
     track, prior_group = keys[0][1:]
     primary = primary_of(track).name
     names = sorted({name for key in keys for name in book.matchers[key]})
@@ -473,33 +453,26 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
     whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
     weighed = [at for at, key in enumerate(shown) if ranked[key]]  # the others have too few places
     has_mean = len(weighed) > 1 and len(whole - book.controls) > 1
-
-    def figure(name: str, key: Key) -> Cell:
-        return short_cell(by_suite[key][name], is_rivalled=ranked[key] > 1)
-
-    def false_fixes(name: str, key: Key) -> Cell:
-        return short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False)
-
-    fields: list[Field[str]] = [
-        (word("matcher"), book.short_name),
-        *fields_of(((_suite_column(book, key, primary, has_absent=key in absent), key) for key in shown), figure),
-        *fields_of(((column("false fixes", title=f"{key[0]}: false fixes"), key) for key in absent), false_fixes),
-    ]
-    if has_mean:
-        means = {
-            name: _mean_value([found[name][at] for at in weighed]) if name in whole else math.nan for name in order
-        }
-        fields.append((column("mean"), lambda name: means[name]))
-    table = table_of(
-        file_stem("summary", track, prior_group),
-        f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-        order,
-        fields,
-        tone=lambda name: "head" if name in book.controls else "plain",
+    rows = _overview_heads(book, shown, absent, primary, has_mean=has_mean)
+    for name in order:
+        cells = [short_cell(by_suite[key][name], is_rivalled=ranked[key] > 1) for key in shown]
+        cells += [short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False) for key in absent]
+        if has_mean:
+            cells.append(number_cell(_mean_value([found[name][at] for at in weighed]) if name in whole else math.nan))
+        tone = "head" if name in book.controls else "plain"
+        rows.append(Row(cells=(book.short_name(name), *cells), tone=tone))
+    columns = (
+        *(_suite_column(book, key, primary, has_absent=key in absent) for key in shown),
+        *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
+        *([column("mean")] if has_mean else []),
     )
-    rows = (*_overview_heads(book, shown, absent, primary, has_mean=has_mean), *table.rows)
-    notes = tuple(_overview_notes(primary, rows, has_absent=bool(absent), has_several=len(shown) > 1))
-    return replace(table, rows=rows, notes=notes)
+    return Table(
+        name=file_stem("summary", track, prior_group),
+        title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
+        columns=(word("matcher"), *columns),
+        rows=tuple(rows),
+        notes=tuple(_overview_notes(primary, rows, has_absent=bool(absent), has_several=len(shown) > 1)),
+    )
 
 
 def _order(book: Book, found: Mapping[str, Sequence[Record | None]]) -> list[str]:
@@ -615,109 +588,16 @@ SHOWN_RATIO: Final = 20.0  # of the costs of a false fix and of withholding a ri
 _MIXTURES: Final = (AS_DRAWN, *map(mixture_name, PRESENT_SHARES))
 
 
-def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
-    """Return matcher x rejector over all suites, a table for each track and prior group."""
-    found = _rejection_rows(board).groupby(["track", "prior_group"], sort=True)
-    return tuple(
-        _rejection_table(
-            part, file_stem("rejection", *map(str, key)), f"Rejection: {key[0]}, {prior_words(str(key[1]))}"
-        )
-        for key, part in found
-    )
-
-
-def risk_tables(board: pd.DataFrame) -> tuple[Table, ...]:
-    """Return what ranked matchers answer where 5 % of the answers may be false, a table for each track and prior group.
-
-    A line is a matcher with the rejector that orders its answers best, by their area; `rejection_tables` have them all.
-    """
-    found = (_risk_table(best, *named) for best, _, *named in _groups(board, "risk"))
-    return tuple(table for table in found if table.rows)
-
-
-def risk_tables_by_suite(board: pd.DataFrame) -> tuple[Table, ...]:
-    """Return how many of the answers of `risk_tables` are false where more places are absent, and in each suite."""
-    found = (_risk_by_suite(best, part, *named) for best, part, *named in _groups(board, "risk-by-suite"))
-    return tuple(table for table in found if table.rows)
-
-
 Pair = tuple[str, str]  # matcher and rejector
 Best = Mapping[Pair, Mapping[str, Record]]  # figures by metric
-_PAIR: Final[tuple[Field[tuple[str, ...]], ...]] = (
-    (word("matcher"), lambda pair: pair[0]),
-    (word("rejector"), lambda pair: pair[1]),
-)
 
 
-def _groups(board: pd.DataFrame, stem: str) -> Iterator[tuple[Best, pd.DataFrame, str, str]]:
-    """Yield by track and prior group the best pairs, the rows of all, the name of a table, and what it is of."""
-    rows = board[(board["rejector"] != "") & ~board["matcher"].map(is_unranked).astype(bool)]
-    for (track, prior_group), part in rows.groupby(["track", "prior_group"], sort=True):
-        where = f"{track}, {prior_words(str(prior_group))}"
-        yield _best_pairs(_rejection_rows(part)), part, file_stem(stem, str(track), str(prior_group)), where
-
-
-def _best_pairs(part: pd.DataFrame) -> Best:
-    """Return the figures of each matcher with the rejector of the least area, in the order of that area."""
-    found = {(str(key[0]), str(key[1])): _by_metric(mine) for key, mine in part.groupby(["matcher", "rejector"])}
-    order = sorted((_area(by_name), key) for key, by_name in found.items())
-    best: dict[str, tuple[str, str]] = {}
-    for area, key in order:
-        if area < math.inf:
-            best.setdefault(key[0], key)
-    return {key: found[key] for key in best.values()}
-
-
-def _risk_table(best: Best, name: str, where: str) -> Table:
-    fields: tuple[Field[Pair], ...] = (
-        *_PAIR,
-        (column(COVERED, title="answered"), lambda pair: figure_cell(best[pair].get(COVERED))),
-        (column(REACHED, title="false of these"), lambda pair: figure_cell(best[pair].get(REACHED))),
-        (word("risk kept"), lambda pair: _kept(best[pair].get(REACHED))),
-        (column("n"), lambda pair: int(best[pair]["aurc"]["n"])),
-    )
-    return table_of(name, f"Answers where 5 % of them may be false fixes: {where}", best, fields, notes=_RISK_NOTES)
-
-
-def _kept(row: Record | None) -> str:
-    """Return whether the interval of a reached risk shows that it was kept.
-
-    >>> [_kept({"lo": lo, "hi": hi}) for lo, hi in ((0.0, 0.04), (0.03, 0.07), (0.06, 0.2))], _kept(None)
-    (['yes', 'open', 'no'], '-')
-    """
-    if row is None or math.isnan(row["lo"]):
-        return "-"
-    if row["hi"] <= SHOWN_RISK:
-        return "yes"
-    return "no" if row["lo"] > SHOWN_RISK else "open"
-
-
-def _risk_by_suite(best: Best, part: pd.DataFrame, name: str, where: str) -> Table:
-    reached = part[part["metric"] == REACHED]
-    suites = sorted(set(reached["suite"]) - {ALL_SUITES})
-    shares = {mixture_name(share): f"{100 * (1 - share):.0f} % of places absent" for share in PRESENT_SHARES}
-    places = [(ALL_SUITES, mixture) for mixture in shares] + [(suite, AS_DRAWN) for suite in suites]
-    keys = zip(*(reached[field] for field in ("matcher", "rejector", "suite", "stratum")), strict=True)
-    by_key: dict[tuple[str, ...], Record] = dict(zip(keys, records_of(reached), strict=True))
-    columns = [(column(REACHED, title=shares.get(part, suite)), (suite, part)) for suite, part in places]
-
-    def reached_there(pair: Pair, place: tuple[str, str]) -> Cell:
-        return short_cell(by_key.get((*pair, *place)), has_rank=False)
-
-    fields: tuple[Field[Pair], ...] = (*_PAIR, *fields_of(columns, reached_there))
-    title = f"How many of these are false, by share of absent places and by suite: {where}"
-    return table_of(name, title, best, fields, notes=_BY_SUITE_NOTES)
-
-
-def _by_metric(part: pd.DataFrame) -> dict[str, Record]:
-    """Return the rows of one matcher and rejector by their metric."""
-    return {str(row["metric"]): row for row in records_of(part)}
-
-
-def _area(by_name: Mapping[str, Record]) -> float:
-    """Return the area that orders rejectors, infinite where there is none."""
-    area = by_name["aurc"]["value"] if "aurc" in by_name else math.nan
-    return math.inf if math.isnan(area) else float(area)
+def rejection_tables(board: pd.DataFrame) -> Iterator[Table]:
+    """Yield matcher x rejector over all suites, a table for each track and prior group."""
+    for key, part in _rejection_rows(board).groupby(["track", "prior_group"], sort=True):
+        track, prior_group = map(str, key)
+        title = f"Rejection: {track}, {prior_words(prior_group)}"
+        yield _rejection_table(part, file_stem("rejection", track, prior_group), title)
 
 
 def rejection_of(board: pd.DataFrame, matcher: str) -> Table | None:
@@ -740,73 +620,149 @@ def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: 
         tuple(map(str, key)): _by_metric(mine)
         for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True)
     }
-    controls = {key for key in found if is_unranked(key[0])}
-
-    def figure(key: tuple[str, ...], metric: str) -> Cell:
-        return figure_cell(found[key].get(metric))
-
-    metrics = ((column(metric, order="ascending" if metric == "aurc" else "none"), metric) for metric in _REJECTION)
-    fields: list[Field[tuple[str, ...]]] = [
-        *_PAIR,
-        *([(word("queries"), lambda key: f"{key[2]}, {key[3]}")] if has_queries else []),
-        *fields_of(metrics, figure),
-        (column("n"), lambda key: int(next(iter(found[key].values()))["n"])),
+    is_control = {key: is_unranked(key[0]) for key in found}
+    order = sorted(found, key=lambda key: (is_control[key], _area(found[key]), key))
+    columns = [column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")]
+    lines: list[tuple[Shown, ...]] = [
+        (
+            *key[:2],
+            *([f"{key[2]}, {key[3]}"] if has_queries else []),
+            *(figure_cell(found[key].get(metric)) for metric in _REJECTION),
+            int(next(iter(found[key].values()))["n"]),
+        )
+        for key in order
     ]
-    return table_of(
+    return grid_of(
         name,
         title,
-        sorted(found, key=lambda key: (key in controls, _area(found[key]), key)),
-        fields,
+        (word("matcher"), word("rejector"), *([word("queries")] if has_queries else []), *columns),
+        lines,
         notes=("ECE and costs have no interval on this board: they decide nothing.",),
-        tone=lambda key: "control" if key in controls else "plain",
+        tones=["control" if is_control[key] else "plain" for key in order],
     )
 
 
-def acceptance_tables(acceptance: pd.DataFrame) -> tuple[Table, ...]:
-    """Return risk and coverage by the kind of absence, a table for each track and prior group; none without any.
+def _by_metric(part: pd.DataFrame) -> dict[str, Record]:
+    return {str(row["metric"]): row for row in records_of(part)}
+
+
+def _area(by_name: Mapping[str, Record]) -> float:
+    """Return the area that orders rejectors, infinite where there is none."""
+    area = by_name["aurc"]["value"] if "aurc" in by_name else math.nan
+    return math.inf if math.isnan(area) else float(area)
+
+
+def risk_tables(board: pd.DataFrame) -> Iterator[Table]:
+    """Yield what ranked matchers answer where 5 % of the answers may be false, a table for each track and prior group.
+
+    A line is a matcher with the rejector that orders its answers best, by their area; `rejection_tables` have them all.
+    """
+    answered, reached = column(COVERED, title="answered"), column(REACHED, title="false of these")
+    for best, _, track, prior_group in _best_pairs(board):
+        yield grid_of(
+            file_stem("risk", track, prior_group),
+            f"Answers where 5 % of them may be false fixes: {track}, {prior_words(prior_group)}",
+            (word("matcher"), word("rejector"), answered, reached, word("risk kept"), column("n")),
+            [
+                (
+                    *pair,
+                    figure_cell(by_name.get(COVERED)),
+                    figure_cell(by_name.get(REACHED)),
+                    _kept(by_name.get(REACHED)),
+                    int(by_name["aurc"]["n"]),
+                )
+                for pair, by_name in best.items()
+            ],
+            notes=_RISK_NOTES,
+        )
+
+
+def risk_tables_by_suite(board: pd.DataFrame) -> Iterator[Table]:
+    """Yield how many of the answers of `risk_tables` are false where more places are absent, and in each suite."""
+    shares = {mixture_name(share): f"{100 * (1 - share):.0f} % of places absent" for share in PRESENT_SHARES}
+    for best, part, track, prior_group in _best_pairs(board):
+        reached = part[part["metric"] == REACHED]
+        suites = sorted(set(reached["suite"]) - {ALL_SUITES})
+        places = [(ALL_SUITES, mixture) for mixture in shares] + [(suite, AS_DRAWN) for suite in suites]
+        keys = zip(*(reached[field] for field in ("matcher", "rejector", "suite", "stratum")), strict=True)
+        by_key: dict[tuple[str, ...], Record] = dict(zip(keys, records_of(reached), strict=True))
+        titles = (*shares.values(), *suites)
+        where = f"{track}, {prior_words(prior_group)}"
+        yield grid_of(
+            file_stem("risk-by-suite", track, prior_group),
+            f"How many of these are false, by share of absent places and by suite: {where}",
+            (word("matcher"), word("rejector"), *(column(REACHED, title=title) for title in titles)),
+            [(*pair, *(short_cell(by_key.get((*pair, *place)), has_rank=False) for place in places)) for pair in best],
+            notes=_BY_SUITE_NOTES,
+        )
+
+
+def _best_pairs(board: pd.DataFrame) -> Iterator[tuple[Best, pd.DataFrame, str, str]]:
+    """Yield the matchers, each with the rejector of the least area, by that area, of a track and prior group.
+
+    With them come the rows of all, track and prior group; without a matcher that has an area there is nothing.
+    """
+    rows = board[(board["rejector"] != "") & ~board["matcher"].map(is_unranked).astype(bool)]
+    for (track, prior_group), part in rows.groupby(["track", "prior_group"], sort=True):
+        pairs = _rejection_rows(part).groupby(["matcher", "rejector"])
+        found = {(str(key[0]), str(key[1])): _by_metric(mine) for key, mine in pairs}
+        best: dict[str, Pair] = {}
+        for area, key in sorted((_area(by_name), key) for key, by_name in found.items()):
+            if area < math.inf:
+                best.setdefault(key[0], key)
+        if best:
+            yield {key: found[key] for key in best.values()}, part, str(track), str(prior_group)
+
+
+def _kept(row: Record | None) -> str:
+    """Return whether the interval of a reached risk shows that it was kept.
+
+    >>> [_kept({"lo": lo, "hi": hi}) for lo, hi in ((0.0, 0.04), (0.03, 0.07), (0.06, 0.2))], _kept(None)
+    (['yes', 'open', 'no'], '-')
+    """
+    if row is None or math.isnan(row["lo"]):
+        return "-"
+    if row["hi"] <= SHOWN_RISK:
+        return "yes"
+    return "no" if row["lo"] > SHOWN_RISK else "open"
+
+
+def acceptance_tables(acceptance: pd.DataFrame) -> Iterator[Table]:
+    """Yield risk and coverage by the kind of absence, a table for each track and prior group, the least risk first.
 
     `acceptance` is from `rejection.acceptance_frame`. One cost ratio is shown, and no controls.
     """
     if not len(acceptance):
-        return ()
+        return
     shown = acceptance[(acceptance["cost_ratio"] == SHOWN_RATIO) & ~acceptance["matcher"].map(is_unranked).astype(bool)]
-    return tuple(
-        _acceptance_table(part, str(track), str(prior_group))
-        for (track, prior_group), part in shown.groupby(["track", "prior_group"], sort=True)
-    )
-
-
-def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
-    """Return risk and coverage, who has the least risk over all absences first, and an absence a line."""
-    found = {
-        tuple(map(str, key)): {str(row["mixture"]): row for row in records_of(mine)}
-        for key, mine in part.groupby(["matcher", "rejector", "absence"], sort=True)
-    }
-    risks = {key: float(rows[AS_DRAWN]["risk"]) for key, rows in found.items() if AS_DRAWN in rows}
-    whole = {key[:2]: risk for key, risk in risks.items() if key[2] == "all" and not math.isnan(risk)}
-
-    def share(key: tuple[str, ...], of: tuple[str, str]) -> Cell:
-        return share_cell(found[key].get(of[0]), of[1])
-
-    shares = [AS_DRAWN, *(f"{100 * (1 - share):.0f} % absent" for share in PRESENT_SHARES)]
+    shares = (AS_DRAWN, *(f"{100 * (1 - share):.0f} % absent" for share in PRESENT_SHARES))
     columns = [
-        (column(term, title=f"{name}, {share}"), (mixture, name))
-        for mixture, share in zip(_MIXTURES, shares, strict=True)
-        for term, name in (("risk of fixes", "risk"), ("coverage", "coverage"))
+        column(term, title=f"{term.split()[0]}, {share}") for share in shares for term in ("risk of fixes", "coverage")
     ]
-    fields: tuple[Field[tuple[str, ...]], ...] = (
-        *_PAIR,
-        (word("absence"), lambda key: key[2]),
-        (column("absent"), lambda key: int(next(iter(found[key].values()))["absent"])),
-        *fields_of(columns, share),
-    )
-    return table_of(
-        file_stem("acceptance", track, prior_group),
-        f"Risk and coverage by kind of absence: {track}, {prior_words(prior_group)}",
-        sorted(found, key=lambda key: (whole.get(key[:2], math.inf), key)),
-        fields,
-        notes=(f"Fixes accepted by Eq. 14 at costs of {SHOWN_RATIO:g} to 1; acceptance.parquet holds other costs.",),
-    )
+    for (track, prior_group), part in shown.groupby(["track", "prior_group"], sort=True):
+        found = {
+            tuple(map(str, key)): {str(row["mixture"]): row for row in records_of(mine)}
+            for key, mine in part.groupby(["matcher", "rejector", "absence"], sort=True)
+        }
+        risks = {key: float(rows[AS_DRAWN]["risk"]) for key, rows in found.items() if AS_DRAWN in rows}
+        whole = {key[:2]: risk for key, risk in risks.items() if key[2] == "all" and not math.isnan(risk)}
+        lines: list[tuple[Shown, ...]] = [
+            (
+                *key,
+                int(next(iter(rows.values()))["absent"]),
+                *(share_cell(rows.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")),
+            )
+            for key, rows in sorted(found.items(), key=lambda item: (whole.get(item[0][:2], math.inf), item[0]))
+        ]
+        yield grid_of(
+            file_stem("acceptance", str(track), str(prior_group)),
+            f"Risk and coverage by kind of absence: {track}, {prior_words(str(prior_group))}",
+            (word("matcher"), word("rejector"), word("absence"), column("absent"), *columns),
+            lines,
+            notes=(
+                f"Fixes accepted by Eq. 14 at costs of {SHOWN_RATIO:g} to 1; acceptance.parquet holds other costs.",
+            ),
+        )
 
 
 def share_cell(row: Record | None, name: str) -> Cell:
@@ -825,27 +781,24 @@ def protection_tables(protection: pd.DataFrame) -> Iterator[Table]:
     limits = sorted(set(protection["alert_limit_m"])) if len(protection) else ()
     shown_m = FIX_M if FIX_M in limits else next(iter(limits), FIX_M)
     others = " and ".join(f"{limit:g}" for limit in limits if limit != shown_m)
-    fields: tuple[Field[Record], ...] = (
-        (word("matcher"), lambda row: str(row["matcher"])),
-        (word("method"), lambda row: str(row["method"])),
-        (column("risk", order="ascending"), lambda row: float(row["risk"])),
-        *fields_of(((column(area), area) for area in _AREAS), share_cell),
-        (column("n"), lambda row: int(row["n"])),
-        (word("supports"), lambda row: str(row["supports"])),
-    )
+    columns = (word("matcher"), word("method"), column("risk", order="ascending"), *map(column, (*_AREAS, "n")))
     shown = protection[protection["alert_limit_m"] == shown_m] if limits else protection
     for prior_group, part in shown.groupby("prior_group", sort=True) if limits else ():
         order = part.sort_values(["risk", "available", "matcher", "method"], ascending=[True, False, True, True])
-        yield table_of(
+        yield grid_of(
             file_stem("protection", str(prior_group)),
             f"Alert limit {shown_m:g} m, {prior_words(str(prior_group))}",
-            records_of(order),
-            fields,
+            (*columns, word("supports")),
+            [
+                (
+                    *(str(row["matcher"]), str(row["method"]), float(row["risk"])),
+                    *(share_cell(row, area) for area in _AREAS),
+                    *(int(row["n"]), str(row["supports"])),
+                )
+                for row in records_of(order)
+            ],
             notes=[f"Alert limits of {others} m: protection.parquet holds them."] if others else (),
         )
-
-
-_Found = Mapping[str, Mapping[str, Record]]  # kind of place -> matcher -> row
 
 
 def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
@@ -855,58 +808,44 @@ def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
     anybody are marked.
     """
     parts = scenes.groupby(list(GROUP)) if len(scenes) else ()
-    groups = sorted(parts, key=lambda group: (-int(group[1]["places"].max()), group[0]))
-    for key, part in groups:
+    for key, part in sorted(parts, key=lambda group: (-int(group[1]["places"].max()), group[0])):
+        suite, track, prior_group = map(str, key)
         found: dict[str, dict[str, Record]] = {}
         for row in records_of(part):
             found.setdefault(str(row["stratum"]), {})[str(row["matcher"])] = row
-        yield _table((str(key[0]), str(key[1]), str(key[2])), found, book)
-
-
-def _table(key: Key, found: _Found, book: Book) -> Table:
-    suite, track, prior_group = key
-    use = AS_USED[suite.partition(BY)[0]]
-    kinds = [kind for kind in (ALL, *SCENES) if kind in found]
-    primary = str(next(iter(found[ALL].values()))["metric"])
-    order = sorted(found[ALL], key=lambda name: (-_value(found[ALL][name]), name))
-
-    def figure(name: str, kind: str) -> Cell:
-        return short_cell(found[kind].get(name), is_rivalled=len(order) > 1)
-
-    columns = ((_column(kind, primary), kind) for kind in kinds)
-    fields: tuple[Field[str], ...] = ((word("matcher"), book.short_name), *fields_of(columns, figure))
-    table = table_of(
-        file_stem("kinds", suite, track, prior_group),
-        f"With {use.words} ({suite}): {primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-        order,
-        fields,
-        notes=_scene_notes(suite, use.strength),
-    )
-    return replace(table, rows=(*_scene_heads(found, kinds), *table.rows))
+        use, card = AS_USED[suite.partition(BY)[0]], suite_card(suite)
+        kinds = [kind for kind in (ALL, *SCENES) if kind in found]
+        primary = str(next(iter(found[ALL].values()))["metric"])
+        order = sorted(found[ALL], key=lambda name: (-_value(found[ALL][name]), name))
+        first = [next(iter(found[kind].values())) for kind in kinds]
+        places = [
+            replace(plain_cell(int(row["places"])), marks=(FEW,) if row["places"] < LEAST_PLACES else ())
+            for row in first
+        ]
+        figures = [[short_cell(found[kind].get(name), is_rivalled=len(order) > 1) for kind in kinds] for name in order]
+        notes = [suite_words(suite)]
+        if card is not None and use.strength is not None:
+            notes.append(
+                f"Only views of strength {use.strength:g} ({card.strength_unit}), as they are expected in use."
+            )
+        yield grid_of(
+            file_stem("kinds", suite, track, prior_group),
+            f"With {use.words} ({suite}): {primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
+            (word("matcher"), *(_column(kind, primary) for kind in kinds)),
+            [
+                ("places", *places),
+                ("queries", *(int(row["n"]) for row in first)),
+                *((book.short_name(name), *line) for name, line in zip(order, figures, strict=True)),
+            ],
+            notes=notes,
+            tones=["head", "head", *["plain"] * len(order)],
+        )
 
 
 def _column(kind: str, primary: str) -> Column:
     """Return the column of a kind, which says what its figure is a share of."""
     what = column("kind of place")
     return replace(column(primary, title=kind), meaning=f"{what.meaning}. {primary}: {column(primary).meaning}")
-
-
-def _scene_heads(found: _Found, kinds: list[str]) -> Iterator[Row]:
-    """Yield the lines that count places and queries, those with too few places marked."""
-    first = [next(iter(found[kind].values())) for kind in kinds]
-    places = [
-        replace(plain_cell(int(row["places"])), marks=(FEW,) if row["places"] < LEAST_PLACES else ()) for row in first
-    ]
-    yield Row(cells=(Cell(text="places"), *places), tone="head")
-    yield Row(cells=(Cell(text="queries"), *(plain_cell(int(row["n"])) for row in first)), tone="head")
-
-
-def _scene_notes(suite: str, strength: float | None) -> Iterator[str]:
-    """Yield what is done in a suite, and which of its views are meant where these are not all."""
-    yield suite_words(suite)
-    card = suite_card(suite)
-    if card is not None and strength is not None:
-        yield f"Only views of strength {strength:g} ({card.strength_unit}), as they are expected in use."
 
 
 _CONTROLS_NOTE: Final = (
@@ -985,18 +924,16 @@ def _side(name: str, value: float) -> Cell:
     return Cell(text=f"{name}: {number_text(value)}", key=sort_key(value))
 
 
-_SIDES: Final[tuple[Field[Finding], ...]] = (
-    (column("first"), lambda item: _side(item.first, item.first_value)),
-    (column("second"), lambda item: _side(item.second, item.second_value)),
-    (
-        column("difference"),
-        lambda item: Cell(text=interval_text(item.difference, item.lo, item.hi), key=sort_key(item.difference)),
-    ),
-)
+def _difference(item: Finding) -> Cell:
+    return Cell(text=interval_text(item.difference, item.lo, item.hi), key=sort_key(item.difference))
+
+
 _BY_COUNTRIES: Final = "by countries"
 _OF_CONTRASTS: Final[tuple[Field[Finding], ...]] = (
     (word("contrast"), lambda item: item.name),
-    *_SIDES,
+    (column("first"), lambda item: _side(item.first, item.first_value)),
+    (column("second"), lambda item: _side(item.second, item.second_value)),
+    (column("difference"), _difference),
     (column("by blocks"), lambda item: _ends_text(item.lo_blocks, item.hi_blocks)),
     (column(_BY_COUNTRIES), lambda item: _ends_text(item.lo_countries, item.hi_countries)),
     (column("attainable"), lambda item: item.attainable),
@@ -1009,15 +946,13 @@ _OF_CONTRASTS: Final[tuple[Field[Finding], ...]] = (
 )
 
 
-def _of_finding(item: Falsifier, shown: Callable[[Finding], Shown]) -> Shown:
-    return shown(item.finding)
-
-
 _OF_FALSIFIERS: Final[tuple[Field[Falsifier], ...]] = (
     (word("contrast"), lambda item: item.contrast),
     (word("suite"), lambda item: item.suite),
     (word("kind"), lambda item: item.kind),
-    *fields_of(_SIDES, _of_finding),
+    (column("first"), lambda item: _side(item.finding.first, item.finding.first_value)),
+    (column("second"), lambda item: _side(item.finding.second, item.finding.second_value)),
+    (column("difference"), lambda item: _difference(item.finding)),
     (column("discordant"), lambda item: _discordant_text(item.finding)),
     (column("n"), lambda item: Cell(text=_counts_text(item.finding), key=float(item.finding.n))),
     (word("verdict"), lambda item: item.verdict),

@@ -212,7 +212,6 @@ def number_cell(value: float, unit: str = "") -> Cell:
 
 Shown = Cell | str | int | float | None
 T = TypeVar("T")
-K = TypeVar("K")
 Field = tuple[Column, Callable[[T], Shown]]  # a column, and what it shows of the thing that a line is of
 
 
@@ -229,11 +228,6 @@ def cell_of(value: Shown) -> Cell:
     return number_cell(value) if isinstance(value, float) else plain_cell(value)
 
 
-def fields_of(columns: Iterable[tuple[Column, K]], shown: Callable[[T, K], Shown]) -> tuple[Field[T], ...]:
-    """Return columns of one kind, each with a key; `shown` says what is shown of a thing by that key."""
-    return tuple((column, lambda one, key=key: shown(one, key)) for column, key in columns)
-
-
 def table_of(
     name: str,
     title: str,
@@ -244,9 +238,28 @@ def table_of(
     tone: Callable[[T], str] = lambda _: "plain",
 ) -> Table:
     """Return a table of some things, one a line; each of `fields` is a column, with what it shows of a thing."""
-    rows = (Row(cells=tuple(cell_of(shown(one)) for _, shown in fields), tone=tone(one)) for one in things)
-    columns = tuple(column for column, _ in fields)
-    return Table(name=name, title=title, columns=columns, rows=tuple(rows), notes=tuple(notes))
+    lines, tones = [], []
+    for one in things:
+        lines.append([shown(one) for _, shown in fields])
+        tones.append(tone(one))
+    return grid_of(name, title, [column for column, _ in fields], lines, notes=notes, tones=tones)
+
+
+def grid_of(
+    name: str,
+    title: str,
+    columns: Iterable[Column],
+    lines: Sequence[Sequence[Shown]],
+    *,
+    notes: Iterable[str] = (),
+    tones: Sequence[str] = (),
+) -> Table:
+    """Return a table whose lines are given as they are shown; `tones` say how they look."""
+    rows = [
+        Row(cells=tuple(map(cell_of, line)), tone=tone)
+        for line, tone in zip(lines, tones or ["plain"] * len(lines), strict=True)
+    ]
+    return Table(name=name, title=title, columns=tuple(columns), rows=tuple(rows), notes=tuple(notes))
 
 
 def p_text(p: float) -> str:

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
 from sasgeo_bench.canvas import page
 from sasgeo_bench.errors import counted
+from sasgeo_bench.leaderboard.board_figures import FIGURES, OTHERS
 from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, rejection_of, strata_tables, suite_table
 from sasgeo_bench.leaderboard.manifests import BoardEntry, Learned, Picture
 from sasgeo_bench.leaderboard.plots import FAINT, BoardPage, line_keys, look_of
@@ -25,7 +26,6 @@ from sasgeo_bench.leaderboard.tables import (
     Record,
     Table,
     column,
-    fields_of,
     figure_cell,
     file_stem,
     interval_text,
@@ -46,29 +46,20 @@ from sasgeo_bench.scoring.compare import LOWER
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.metrics import FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
-from sasgeo_bench.scoring.strata import ALL, CONTROL
+from sasgeo_bench.scoring.strata import CONTROL
 from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.tasks.suites.base import SuiteCard
 
-KINDS: Final = {  # of figures, by how their names begin, in the order they are shown
-    "contrast": "Registered contrasts, place by place",
-    "stress": "Success under stress",
-    "age": "Success against the age of the map",
-    "strength": "Success against strength",
-    "distance": "Error along the way",
-    "interval": "How far the odometer carries a fix",
-    "risk": "Risk against coverage",
-    "reliability": "Reliability",
-    "stanford": "Protection levels against errors",
-}
+_OTHERS: Final = "Other figures"
 
 
 def figures_by_kind(figures: Sequence[SiteFigure]) -> dict[str, list[SiteFigure]]:
-    """Return figures under the titles of their kinds."""
-    found: dict[str, list[SiteFigure]] = {title: [] for title in (*KINDS.values(), "Other figures")}
+    """Return figures under the headings of their kinds."""
+    headings = {stem: f"{what[0].upper()}{what[1:]}" for stem, what in FIGURES.items() if stem not in OTHERS}
+    found: dict[str, list[SiteFigure]] = {heading: [] for heading in (*headings.values(), _OTHERS)}
     for item in figures:
-        found[KINDS.get(item.file.partition("-")[0], "Other figures")].append(item)
-    return {title: items for title, items in found.items() if items}
+        found[headings.get(item.file.partition("-")[0], _OTHERS)].append(item)
+    return {heading: items for heading, items in found.items() if items}
 
 
 def _groups(book: Book) -> dict[tuple[str, str], list[Key]]:
@@ -252,7 +243,7 @@ def suites_of(source: SiteSource, book: Book) -> tuple[SuitePage, ...]:
 
 def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
     keys = [key for key in book.matchers if key[0] == name]
-    starts = tuple(f"{file_stem(kind, name, track)}-" for kind in KINDS for _, track, _ in keys)
+    starts = tuple(f"{file_stem(kind, name, track)}-" for kind in FIGURES for _, track, _ in keys)
     regions = sorted({base_of(task.region) for task in source.board.about.tasks if task.suite == name})
     return SuitePage(
         name=name,
@@ -373,19 +364,15 @@ def _results_table(book: Book, name: str, group: tuple[str, str], keys: Sequence
         rivals = (book.main(key, other, primary) for other in book.matchers[key])
         return rank_cell(found[key], ranked=sum(row is not None and not pd.isna(row["rank_best"]) for row in rivals))
 
-    def figure(key: Key, of: tuple[str, str]) -> Cell:
-        return figure_cell(book.pick(key, name, *of))
-
-    def count(key: Key, of: str) -> int:
-        return int(found[key][of])
-
-    figures = ((column("control"), (primary, CONTROL)), (column("false fixes"), (FALSE_ABSENT.name, ALL)))
     fields: tuple[Field[Key], ...] = (
         (word("suite"), lambda key: book.suite_cell(key[0])),
         (column(primary), lambda key: figure_cell(found[key], has_bar=True)),
         (column("rank"), rank),
-        *fields_of(figures, figure),
-        *fields_of(((column(term), term) for term in ("n", "missing", "blocks")), count),
+        (column("control"), lambda key: figure_cell(book.pick(key, name, primary, CONTROL))),
+        (column("false fixes"), lambda key: figure_cell(book.pick(key, name, FALSE_ABSENT.name))),
+        (column("n"), lambda key: int(found[key]["n"])),
+        (column("missing"), lambda key: int(found[key]["missing"])),
+        (column("blocks"), lambda key: int(found[key]["blocks"])),
     )
     table = table_of(file_stem("results", track, prior_group), f"{track}, {prior_words(prior_group)}", found, fields)
     return table.without_empty("control", "false fixes")

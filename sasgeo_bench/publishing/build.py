@@ -43,8 +43,7 @@ from sasgeo_bench.publishing.site_files import (
     site_lock,
     write_site,
 )
-from sasgeo_bench.publishing.site_maps import draw_places, places_on_map, regions_of
-from sasgeo_bench.publishing.site_pages import draw_rates
+from sasgeo_bench.publishing.site_maps import draw_places, draw_rates, places_on_map, regions_of
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.intervals import DRAWS

@@ -31,24 +31,21 @@ from sasgeo_bench.leaderboard.text import (
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.publishing.elsewhere import elsewhere_tables
 from sasgeo_bench.publishing.site_files import SiteFigure, SiteSource
-from sasgeo_bench.publishing.site_maps import OUTCOMES, PlaceMap, place_maps, region_table
+from sasgeo_bench.publishing.site_maps import OUTCOMES, PlaceMap, place_maps, rate_table, region_table
 from sasgeo_bench.publishing.site_pages import (
     BETTER,
-    ContrastSummary,
     MatcherPage,
     SuitePage,
     contrasts_of,
     figures_by_kind,
     matchers_of,
-    rate_table,
     suites_of,
 )
-from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.tasks.query import SEQUENCE, base_of
 from sasgeo_bench.texts import plain
 
 ASSETS: Final = ("site.css", "site.js")
-MAP_ASSETS: Final = ("leaflet.css", "leaflet.js")  # as they came, with their licence
+MAP_ASSETS: Final = ("leaflet.css", "leaflet.js", "LICENSE-leaflet")  # as they came
 FAILURES: Final = (  # in the order they are shown; others follow
     *("aliased", "aged", "occluded", "absent accepted", "right but not accepted"),
     *("one of several", "also without the stress"),
@@ -132,16 +129,11 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         text = templates.get_template(template).render(values, page=name)
         pages[name] = _BLANK_LINES.sub("\n", _INDENTS.sub("", text)) + "\n"
     pages |= {name: templates.get_template(name).render() for name in ASSETS}
-    return pages | _map_files(templates, {place.file: script for place, script in site.maps.items()})
-
-
-def _map_files(templates: Environment, scripts: Mapping[str, str]) -> dict[str, str]:
-    """Return what the page with the map loads; nothing for a board without one."""
-    if not scripts:
-        return {}
-    vendor = resources.files("sasgeo_bench.publishing").joinpath("vendor")
-    kept = {name: vendor.joinpath(name).read_text(encoding="utf-8") for name in (*MAP_ASSETS, "LICENSE-leaflet")}
-    return {"map.js": templates.get_template("map.js").render(), **kept, **scripts}
+    if site.maps:
+        vendor = resources.files("sasgeo_bench.publishing").joinpath("vendor")
+        pages |= {name: vendor.joinpath(name).read_text(encoding="utf-8") for name in MAP_ASSETS}
+        pages |= {"map.js": templates.get_template("map.js").render()}
+    return pages | {place.file: script for place, script in site.maps.items()}
 
 
 def _index(site: Site) -> dict[str, object]:
@@ -151,6 +143,15 @@ def _index(site: Site) -> dict[str, object]:
     tables = site.tables["index.html"]
     overview = tuple(table for table in tables["summary"] if sum(row.tone != "control" for row in table.rows) > 1)
     prices = {table.name.replace("summary", "price", 1) for table in overview}
+    counts = Counter(item.outcome for item in contrasts)
+    outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+    shown = "; ".join(f"{item.headline} ({item.name})" for item in contrasts if item.outcome in BETTER)
+    found = (
+        f"Of {counted(len(contrasts), 'difference')} registered before anything was run: {outcomes}. "
+        f"{f'Shown: {shown}.' if shown else 'Nobody is shown to be better than another.'}"
+    )
+    failed = [item for item in controls if not item.holds]  # the board, or rows of some entries alone
+    is_board = any(item.is_of_board for item in failed)
     return {
         "sections": sections,
         "elsewhere": elsewhere_tables(about.elsewhere),
@@ -159,10 +160,10 @@ def _index(site: Site) -> dict[str, object]:
         "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),
         "ranks_note": RANKS_NOTE,
         "contrasts": contrasts,
-        "found": _found_text(contrasts),
+        "found": found,
         "made_of": _made_of(book),
         "control_lines": control_lines(controls),
-        "controls_state": _controls_state(controls),
+        "controls_state": "failed" if is_board else "held" if controls and not failed else "doubtful",
         "has_controls": bool(controls),
         "seed_line": seed_lines(about)[0],
         "sealed_lines": sealed_lines(about.sealed),
@@ -185,18 +186,14 @@ def _made_of(book: Book) -> str:
     )
 
 
-def _found_text(contrasts: Sequence[ContrastSummary]) -> str:
-    """Return in one line how many registered differences came out how, and which entries are shown to be better."""
-    counts = Counter(item.outcome for item in contrasts)
-    said = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
-    told = [f"{item.headline} ({item.name})" for item in contrasts if item.outcome in BETTER]
-    better = f" Shown: {'; '.join(told)}." if told else " Nobody is shown to be better than another."
-    return f"Of {counted(len(contrasts), 'difference')} registered before anything was run: {said}.{better}"
-
-
 def _failures(site: Site) -> dict[str, object]:
     """Return what the page of failures shows; those of a place with a map lead there."""
     mapped = {place.region for place in site.maps}
+
+    def _on_map(case: FailedCase) -> str:
+        asked = {"place": base_of(case.region), "matcher": case.matcher, "suite": case.suite, "outcome": "failures"}
+        return f"map.html?{urlencode(asked | {'query': case.query_id})}"
+
     groups = groups_of(site.source.pictures.cases)
     numbered = {number: case for group in groups for number, case in group.cases}
     return {
@@ -212,12 +209,6 @@ def _failures(site: Site) -> dict[str, object]:
     }
 
 
-def _on_map(case: FailedCase) -> str:
-    """Return the address of a case on the map of its place."""
-    asked = {"place": base_of(case.region), "matcher": case.matcher, "suite": case.suite, "outcome": "failures"}
-    return f"map.html?{urlencode(asked | {'query': case.query_id})}"
-
-
 def _rejection(site: Site) -> dict[str, object]:
     """Return choices of the matchers and rejectors of the tables of rejection, by name."""
     tables = site.tables["rejection.html"]
@@ -229,18 +220,9 @@ def _rejection(site: Site) -> dict[str, object]:
     return {"filters": [(term.capitalize(), term, sorted(values), {}) for term, values in found.items() if values]}
 
 
-def _map(site: Site) -> dict[str, object]:
-    return {"places": list(site.maps), "outcomes": OUTCOMES, "classes": load_taxonomy().classes}
-
-
 def _method(site: Site) -> dict[str, object]:
     about = site.source.board.about
     return {"learned": [*training_lines(about), *segmenter_lines(about)], "meanings": MEANINGS | MARKS}
-
-
-def _has_rejection(site: Site) -> bool:
-    tables = site.tables["rejection.html"]
-    return bool(tables["rejection"] or tables["protection"])
 
 
 PAGES: Final = (  # in the order of the navigation
@@ -248,9 +230,16 @@ PAGES: Final = (  # in the order of the navigation
     Page("kinds-of-place.html", "Kinds of place", is_there=lambda site: site.tables["kinds-of-place.html"]["kinds"]),
     Page("suites.html", "Suites"),
     Page("matchers.html", "Matchers"),
-    Page("rejection.html", "Rejection", _rejection, _has_rejection),
+    Page(
+        "rejection.html",
+        "Rejection",
+        _rejection,
+        lambda site: any(site.tables["rejection.html"][kind] for kind in ("rejection", "protection")),
+    ),
     Page("figures.html", "Figures", is_there=lambda site: site.source.figures),
-    Page("map.html", "Map", _map, lambda site: site.maps),
+    Page(
+        "map.html", "Map", lambda _: {"outcomes": OUTCOMES, "classes": load_taxonomy().classes}, lambda site: site.maps
+    ),
     Page("failures.html", "Failures", _failures, lambda site: site.source.pictures.cases),
     Page("regions.html", "Regions", lambda site: {"table": region_table(site.source)}),
     Page("ageing.html", "Ageing", lambda site: {"table": rate_table(site.source.rates)}),
@@ -274,14 +263,6 @@ def _shown(value: object) -> object:
     if not isinstance(value, str) or hasattr(value, "__html__"):
         return value
     return _INTERVAL.sub(rf"[\1,{_FIRM}\2]", plain(value))
-
-
-def _controls_state(verdicts: Sequence[Verdict]) -> str:
-    """Return the class of the page's box: what failed is the board, or rows of some entries alone."""
-    failed = [item for item in verdicts if not item.holds]
-    if any(item.is_of_board for item in failed):
-        return "failed"
-    return "held" if verdicts and not failed else "doubtful"
 
 
 def _size_text(source: SiteSource, book: Book) -> str:

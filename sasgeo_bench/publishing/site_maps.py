@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a board's queries lie: its places on a map and in a table, and the scripts of the page with the answers."""
+"""Where a board's queries lie, how fast such maps grow old, and the scripts of the page with the answers."""
 
 import json
 import math
@@ -13,22 +13,26 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
 from sasgeo_bench.canvas import GREY, page
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.cases import FAILURES, MEANINGS
 from sasgeo_bench.leaderboard.manifests import BoardTask, RegionMap
 from sasgeo_bench.leaderboard.plots import FAINT, BoardPage, line_keys, look_of
 from sasgeo_bench.leaderboard.tables import (
+    Cell,
     Field,
     Record,
     Table,
     column,
     file_stem,
+    interval_text,
     plain_cell,
     records_of,
     table_of,
     word,
 )
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.publishing.site_files import MAPS, SiteSource, Spot
 from sasgeo_bench.scoring.intervals import seed_of_text
 from sasgeo_bench.tasks.query import base_of
@@ -87,21 +91,21 @@ def region_table(source: SiteSource) -> Table:
     numbers = {item.name: item.number for item in places_on_map(source.board.about.tasks, source.spots, source.parts)}
     listed = regions_of(source.board.about.tasks)
 
-    def place_and_part(region: str) -> tuple[str, str]:
+    def _part(region: str) -> tuple[str, str]:
         return source.parts.get(region, (region, "-"))
 
-    def title(region: str) -> str:
+    def _title(region: str) -> str:
         return f"{source.spots[region].title} ({region})" if region in source.spots else region
 
-    def scenes(region: str) -> str:
+    def _scenes(region: str) -> str:
         return ", ".join(source.spots[region].scenes) if region in source.spots else "-"
 
     fields: tuple[Field[str], ...] = (
-        (word("regions", order="ascending"), title),
-        (column("no."), lambda region: plain_cell(numbers.get(place_and_part(region)[0]))),
-        (word("place"), lambda region: place_and_part(region)[0]),
-        (word("half or part"), lambda region: place_and_part(region)[1] or "-"),
-        (word("scenes"), scenes),
+        (word("regions", order="ascending"), _title),
+        (column("no."), lambda region: plain_cell(numbers.get(_part(region)[0]))),
+        (word("place"), lambda region: _part(region)[0]),
+        (word("half or part"), lambda region: _part(region)[1] or "-"),
+        (word("scenes"), _scenes),
         (
             word("dates"),
             lambda region: ", ".join(sorted({one.map_date for one in listed[region] if one.map_date})) or "-",
@@ -124,7 +128,8 @@ _LABEL_POINTS: Final = 6.5
 def draw_places(path: Path, places: Sequence[PlaceOnMap]) -> None:
     """Draw the places of a board on a map into a .svg or .png; Europe also alone where some lie elsewhere."""
     parts = sorted({item.part for item in places})
-    near = [item for item in places if _is_near(item)]
+    west, east, south, north = _EUROPE
+    near = [item for item in places if west <= item.longitude_deg <= east and south <= item.latitude_deg <= north]
     panels = [("all places", list(places))]
     if 1 < len(near) < len(places):
         panels.append(("those in Europe", near))
@@ -135,24 +140,13 @@ def draw_places(path: Path, places: Sequence[PlaceOnMap]) -> None:
         below="longitude (deg)",
         columns=len(panels),
         panel_inches=(3.6, 2.9) if len(panels) > 1 else (5.4, 3.2),
-        keys=line_keys([_part_name(part) for part in parts]),
+        keys=line_keys([f"half {part}" if len(part) == 1 else part or "no part" for part in parts]),
     )
     with page(path, about) as charts:
         for chart, (title, some) in zip(charts[0], panels, strict=True):
             chart.set_title(f"{title} (n = {len(some)})")
             _draw_spots(chart, some, parts)
         charts[0][0].set_ylabel("latitude (deg)")
-
-
-def _is_near(place: PlaceOnMap) -> bool:
-    west, east, south, north = _EUROPE
-    return west <= place.longitude_deg <= east and south <= place.latitude_deg <= north
-
-
-def _part_name(part: str) -> str:
-    if not part:
-        return "no part"
-    return f"half {part}" if len(part) == 1 else part
 
 
 def _draw_spots(chart: Axes, places: Sequence[PlaceOnMap], parts: Sequence[str]) -> None:
@@ -170,6 +164,87 @@ def _draw_spots(chart: Axes, places: Sequence[PlaceOnMap], parts: Sequence[str])
     for values, limits in ((lon, chart.set_xlim), (lat, chart.set_ylim)):
         limits(float(values.min()) - _MARGIN_DEG, float(values.max()) + _MARGIN_DEG)
     chart.grid(visible=True, color=FAINT, lw=0.6)
+
+
+# --- measured ageing --------------------------------------------------------------------------------------------------
+
+
+def rate_table(book: RateBook) -> Table:
+    """Return measured yearly rates with their intervals, a row for each class of a place."""
+    titles = {item.name: item.title for item in load_taxonomy().classes}
+    found = [
+        (titles[name], place.name, place.classes[name])
+        for name in titles
+        for place in book.places
+        if name in place.classes
+    ]
+    fields: tuple[Field[tuple[str, str, ClassAgeing]], ...] = (
+        (word("class"), lambda row: row[0]),
+        (word("compared at", title="place"), lambda row: row[1]),
+        (column("years"), lambda row: _short_cell(row[2].years)),
+        (column("things"), lambda row: Cell(text=f"{row[2].n_from} to {row[2].n_to}", key=float(row[2].n_from))),
+        (column("vanishes", title="vanishes (%/year)"), lambda row: _rate_cell(row[2].vanish_per_year)),
+        (column("appears", title="appears (%/year)"), lambda row: _rate_cell(row[2].appear_per_year)),
+        (column("re-drawn", title="re-drawn (%)"), lambda row: _short_cell(row[2].redrawn_share, per=100)),
+        (column("moved", title="moved (m)"), lambda row: _short_cell(row[2].shift_median_m)),
+    )
+    note = "Of few things a rate says little. What appears is mostly mapping that catches up, not new building."
+    return table_of("rates", "Yearly rates by class and place", found, fields, notes=[note])
+
+
+def _rate_cell(rate: Estimate | None) -> Cell:
+    if rate is None:
+        return Cell(text="-")
+    ends = [math.nan if end is None else 100 * end for end in (rate.lo, rate.hi)]
+    return Cell(text=interval_text(100 * rate.best, *ends), key=rate.best)
+
+
+def _short_cell(value: float | None, *, per: int = 1) -> Cell:
+    return Cell(text="-") if value is None else Cell(text=f"{per * value:.1f}", key=per * value)
+
+
+_RATES: Final = (0.05, 100.0)  # % a year; what lies beyond is drawn at the edge
+_STEP: Final = 0.13  # between two places of a class
+
+
+def draw_rates(path: Path, book: RateBook) -> None:
+    """Draw into a .svg or .png what vanishes and what appears in a year, by class, a mark for each measured place."""
+    titles = {item.name: item.title for item in load_taxonomy().classes}
+    names = [name for name in titles if any(name in place.classes for place in book.places)]
+    about = BoardPage(
+        title=f"How fast maps grow old: {len(book.places)} places",
+        note="Bars: 95 % intervals, from blocks of 1 km. Rates beyond the scale lie at its edge. What appears is "
+        "mostly mapping that catches up. How many things each rate is of stands in the table.",
+        below="per cent a year",
+        columns=2,
+        panel_inches=(3.1, 0.3 + 0.29 * len(names)),
+        keys=line_keys(book.names),
+    )
+    with page(path, about) as charts:
+        for chart, (column, title) in zip(
+            charts[0],
+            (("vanish_per_year", "vanishes, of the older map"), ("appear_per_year", "appears, of the newer map")),
+            strict=True,
+        ):
+            for at, name in enumerate(names):
+                for number, place in enumerate(book.places):
+                    rate = getattr(place.classes.get(name), column, None)
+                    if rate is not None:
+                        y, look = at + _STEP * (number - (len(book.places) - 1) / 2), look_of(number)
+                        ends = [float(np.clip(100 * one, *_RATES)) for one in (rate.lo, rate.hi) if one is not None]
+                        if len(ends) > 1:
+                            chart.hlines(y, ends[0], ends[1], color=look.colour, lw=0.9)
+                        best = float(np.clip(100 * rate.best, *_RATES))
+                        chart.plot(best, y, marker=look.mark, ms=3.2, color=look.colour, ls="")
+            chart.set_title(title)
+            chart.set_xscale("log")
+            chart.set_xlim(_RATES[0] * 0.8, _RATES[1] * 1.2)
+            chart.set_xticks([0.1, 1.0, 10.0, 100.0], ["0.1", "1", "10", "100"])
+            chart.set_ylim(len(names) - 0.5, -0.5)
+            chart.set_yticks(range(len(names)), [titles[name] for name in names])
+            chart.tick_params(axis="y", length=0)
+            chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
+        charts[0][1].set_yticklabels([])
 
 
 # --- the page with the answers ---

@@ -39,8 +39,8 @@ from sasgeo_bench.leaderboard.tables import MEANINGS, file_stem, page_names, tex
 from sasgeo_bench.publishing import site_maps as pages
 from sasgeo_bench.publishing.site import site_pages
 from sasgeo_bench.publishing.site_files import SiteSource, Spot
-from sasgeo_bench.publishing.site_maps import draw_places, place_maps, places_on_map, regions_of
-from sasgeo_bench.publishing.site_pages import contrasts_of, draw_rates, matchers_of
+from sasgeo_bench.publishing.site_maps import draw_places, draw_rates, place_maps, places_on_map, regions_of
+from sasgeo_bench.publishing.site_pages import contrasts_of, matchers_of
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, Falsifier
 from sasgeo_bench.scoring.rows import ALL_SUITES, FIGURE_SCHEMA, Row

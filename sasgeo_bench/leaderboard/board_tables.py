@@ -3,6 +3,7 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Self
@@ -124,7 +125,7 @@ class Book:
             matcher_pages=page_names("matcher", names),
             suite_pages=page_names("suite", [suite for suite, _, _ in sorted(matchers)]),
             counted={key: _counted(rows) for key, rows in _by_group(scored)},
-            lost={key: _lost(rows) for key, rows in _by_group(scored)},
+            lost={key: ", ".join(_lost(rows)) for key, rows in _by_group(scored)},
         )
 
     def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
@@ -176,34 +177,27 @@ def _counted(rows: pd.DataFrame) -> str:
     return "; ".join(texts) + (f" ({', '.join(units)})" if units else "")
 
 
-def _lost(rows: pd.DataFrame) -> str:
-    counts = rows.loc[~rows["status"].isin(_SOUND), ["matcher", "status"]].value_counts(sort=False).sort_index()
-    named = (f"{key[0]} {count} ({key[1]})" for key, count in counts.items() if isinstance(key, tuple))
-    return ", ".join(named)
+def _lost(rows: pd.DataFrame) -> list[str]:
+    lost = rows[~rows["status"].isin(_SOUND)]
+    counts = Counter(zip(lost["matcher"], lost["status"], strict=True))
+    return [f"{matcher} {count} ({status})" for (matcher, status), count in sorted(counts.items())]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """One suite, track and prior group: its table, and that of contestants that are set apart, if any."""
+    """One suite, track and prior group: its table, and that of contestants that are set apart, if any.
+
+    `context` says which queries the table counts, and the success on them without a method.
+    """
 
     suite: str
     track: str
     prior_group: str
     prior: str
     suite_page: str
-    counted: str
-    for_nothing: str
-    attainable: str
+    context: str
     table: Table
     apart: Table | None = None
-
-    @property
-    def context(self) -> str:
-        """Return which queries the table counts, and the success on them without a method."""
-        texts = [f"Stress that is counted: {self.counted}."] if self.counted else []
-        texts += [f"Without looking at the view: {self.for_nothing}."] if self.for_nothing else []
-        texts += [f"Attainable: {self.attainable}."] if self.attainable else []
-        return " ".join(texts)
 
 
 def sections_of(book: Book) -> tuple[Section, ...]:
@@ -217,21 +211,30 @@ def _section(book: Book, key: Key) -> Section:
     names = book.matchers[key]
     apart = [name for name in names if book.is_set_apart(name)]
     table = suite_table(book, key, [name for name in names if name not in apart])
-    unasked = [name for name in book.entries if name not in names]
-    lost = book.lost.get(key, "")
-    lines = [*table.notes, *([f"Without a sound answer, which is a miss: {lost}."] if lost else [])]
-    lines += [f"Not asked here: {', '.join(unasked)}."] if unasked else []
+    beside = {
+        "Without a sound answer, which is a miss": book.lost.get(key, ""),
+        "Not asked here": ", ".join(name for name in book.entries if name not in names),
+    }
+    context = {
+        "Stress that is counted": book.counted.get(key, ""),
+        "Without looking at the view": _for_nothing(book, key),
+        "Attainable": _attainable(book, key),
+    }
+    set_apart = replace(
+        suite_table(book, key, apart),
+        name=f"{table.name}-apart",
+        title=f"Set apart, not to be compared with those above: {suite}, {track}",
+        notes=tuple(f"{name}: {book.entries[name].set_apart}." for name in apart),
+    )
     return Section(
         suite=suite,
         track=track,
         prior_group=prior_group,
         prior=prior_words(prior_group),
         suite_page=book.suite_pages[suite],
-        counted=book.counted.get(key, ""),
-        for_nothing=_for_nothing(book, key),
-        attainable=_attainable(book, key),
-        table=replace(table, notes=tuple(lines)),
-        apart=_apart(book, key, apart) if apart else None,
+        context=" ".join(f"{what}: {text}." for what, text in context.items() if text),
+        table=replace(table, notes=(*table.notes, *(f"{what}: {text}." for what, text in beside.items() if text))),
+        apart=set_apart if apart else None,
     )
 
 
@@ -240,13 +243,6 @@ def suite_tables(book: Book) -> Iterator[Table]:
     for section in sections_of(book):
         yield replace(section.table, notes=(*filter(None, (section.context,)), *section.table.notes))
         yield from filter(None, (section.apart,))
-
-
-def _apart(book: Book, key: Key, names: Sequence[str]) -> Table:
-    table = suite_table(book, key, names)
-    reasons = tuple(f"{name}: {book.entries[name].set_apart}." for name in names)
-    title = f"Set apart, not to be compared with those above: {key[0]}, {key[1]}"
-    return replace(table, name=f"{table.name}-apart", title=title, notes=reasons)
 
 
 def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
@@ -449,7 +445,11 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
     shown = sorted((key for key in keys if any(by_suite[key].values())), key=lambda key: (-ranked[key], key))
     absent = [key for key in shown if any(book.pick(key, name, FALSE_ABSENT.name) for name in names)]
     found = {name: [by_suite[key][name] for key in shown] for name in names}
-    order = _order(book, found)
+    means = {name: _mean_value(rows) for name, rows in found.items()}
+    order = sorted(  # controls, then matchers: who was asked about more suites first, then who is better on them
+        (name for name, rows in found.items() if any(row is not None for row in rows)),
+        key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
+    )
     whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
     weighed = [at for at, key in enumerate(shown) if ranked[key]]  # the others have too few places
     has_mean = len(weighed) > 1 and len(whole - book.controls) > 1
@@ -472,15 +472,6 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
         columns=(word("matcher"), *columns),
         rows=tuple(rows),
         notes=tuple(_overview_notes(primary, rows, has_absent=bool(absent), has_several=len(shown) > 1)),
-    )
-
-
-def _order(book: Book, found: Mapping[str, Sequence[Record | None]]) -> list[str]:
-    """Return controls, then matchers: who was asked about more suites first, then who is better on them."""
-    means = {name: _mean_value(rows) for name, rows in found.items()}
-    return sorted(
-        (name for name, rows in found.items() if any(row is not None for row in rows)),
-        key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
     )
 
 
@@ -823,6 +814,7 @@ def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
             for row in first
         ]
         figures = [[short_cell(found[kind].get(name), is_rivalled=len(order) > 1) for kind in kinds] for name in order]
+        meaning = f"{column('kind of place').meaning}. {primary}: {column(primary).meaning}"
         notes = [suite_words(suite)]
         if card is not None and use.strength is not None:
             notes.append(
@@ -831,7 +823,7 @@ def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
         yield grid_of(
             file_stem("kinds", suite, track, prior_group),
             f"With {use.words} ({suite}): {primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-            (word("matcher"), *(_column(kind, primary) for kind in kinds)),
+            (word("matcher"), *(replace(column(primary, title=kind), meaning=meaning) for kind in kinds)),
             [
                 ("places", *places),
                 ("queries", *(int(row["n"]) for row in first)),
@@ -840,12 +832,6 @@ def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
             notes=notes,
             tones=["head", "head", *["plain"] * len(order)],
         )
-
-
-def _column(kind: str, primary: str) -> Column:
-    """Return the column of a kind, which says what its figure is a share of."""
-    what = column("kind of place")
-    return replace(column(primary, title=kind), meaning=f"{what.meaning}. {primary}: {column(primary).meaning}")
 
 
 _CONTROLS_NOTE: Final = (

@@ -6,7 +6,7 @@ Each figure has a line for each matcher, and a panel for each kind of flight of 
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -45,10 +45,6 @@ _ACROSS: Final = 3
 _INCHES: Final = 3.4
 _ONE_INCHES: Final = 6.4  # of a panel alone
 _RIGHT, _FALSE, _WITHHELD = "#00897b", "#d50000", "#5c6bc0"
-_LINE: Final[dict[str, Any]] = {"color": _WITHHELD, "lw": 1.0}
-_IS_RIGHT: Final[dict[str, Any]] = {"color": "none", "marker": "o", "mfc": _RIGHT, "mec": "white", "ms": 6}
-_IS_FALSE: Final[dict[str, Any]] = {"color": "none", "marker": "X", "mfc": _FALSE, "mec": "white", "ms": 7}
-_IS_WITHHELD: Final[dict[str, Any]] = {"color": "none", "marker": "o", "mfc": _WITHHELD, "mec": "none", "ms": 4}
 
 
 def shown_flight(scores: Mapping[str, pd.DataFrame], suite: str, regions: Sequence[str]) -> tuple[str, str] | None:
@@ -117,12 +113,16 @@ def _keys(shown: Sequence[pd.DataFrame]) -> list[Line2D]:
     accepted, is_near = _judged(views)
     is_posed = views["east_m"].notna().to_numpy(bool)
     kinds = (
-        (is_posed, "estimates, in order", _LINE),
-        (accepted & is_near, f"accepted, within {FIX_M:g} m", _IS_RIGHT),
-        (accepted & ~is_near, f"accepted, beyond {FIX_M:g} m", _IS_FALSE),
-        (is_posed & ~accepted, "not accepted", _IS_WITHHELD),
+        (is_posed, Line2D([], [], color=_WITHHELD, lw=1.0, label="estimates, in order")),
+        (accepted & is_near, _dot(f"accepted, within {FIX_M:g} m", "o", _RIGHT, "white", 6)),
+        (accepted & ~is_near, _dot(f"accepted, beyond {FIX_M:g} m", "X", _FALSE, "white", 7)),
+        (is_posed & ~accepted, _dot("not accepted", "o", _WITHHELD, "none", 4)),
     )
-    return [Line2D([], [], label=label, **style) for marked, label, style in kinds if marked.any()]
+    return [key for marked, key in kinds if marked.any()]
+
+
+def _dot(label: str, marker: str, fill: str, edge: str, points: float) -> Line2D:
+    return Line2D([], [], color="none", marker=marker, mfc=fill, mec=edge, ms=points, label=label)
 
 
 def _judged(views: pd.DataFrame) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

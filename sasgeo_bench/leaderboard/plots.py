@@ -555,7 +555,8 @@ def draw_risk(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Fi
             matcher, mixture = cells[number]
             mine = rows[(rows["matcher"] == matcher) & (rows["mixture"] == mixture)]
             head = matcher if mixture == AS_DRAWN else f"{matcher}, {mixture}"
-            chart.set_title(f"{head}\n{_counts(mine)}")
+            counts = mine.drop_duplicates("rejector")[["n", "answered"]].drop_duplicates().to_numpy().tolist()
+            chart.set_title(f"{head}\n{'; '.join(f'n {n}, {answered} answered' for n, answered in counts)}")
             _risk_lines(chart, mine, rejectors)
             chart.set_xlim(0.0, 1.0)
             chart.set_xticks(HALVES)
@@ -563,12 +564,6 @@ def draw_risk(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Fi
             chart.grid(visible=True, color=FAINT, lw=0.6)
             label_outer(chart, number, columns, len(cells), "risk\n(share of accepted)")
     return figure_of(charts[0][0])
-
-
-def _counts(mine: pd.DataFrame) -> str:
-    """Return the number of queries and answers of a panel, of each line where they differ."""
-    found = mine.drop_duplicates("rejector")[["n", "answered"]].drop_duplicates().to_numpy().tolist()
-    return "; ".join(f"n {n}, {answered} answered" for n, answered in found)
 
 
 def _risk_lines(chart: Axes, mine: pd.DataFrame, rejectors: Sequence[str]) -> None:

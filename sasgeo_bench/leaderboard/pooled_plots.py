@@ -270,7 +270,10 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
     first figure counts, of the suites of the track that all of these matchers were asked.
     """
     rows = []
-    mine = {name: _counted(scores[name]) for name in shown if name in scores}
+    mine = {}
+    for name in (name for name in shown if name in scores):
+        parts = [part[is_counted(part)] for _, part in scores[name].groupby(["suite", "track"], sort=False)]
+        mine[name] = pd.concat(parts, ignore_index=True) if parts else scores[name]
     groups = {key for one in mine.values() for key in zip(one["track"], one["prior_group"], strict=True)}
     for track, prior_group in sorted(groups):
         some = {
@@ -286,12 +289,6 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
             rows.append((suites, track, prior_group, name, *found, *_costs_of(table, name, track)))
     columns = ["suites", "track", "prior_group", "matcher", *_Figure._fields, *COSTS.values()]
     return pd.DataFrame(rows, columns=columns)
-
-
-def _counted(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows that the first figure of each suite counts, of places that are on the map."""
-    parts = [part[is_counted(part)] for _, part in frame.groupby(["suite", "track"], sort=False)]
-    return pd.concat(parts, ignore_index=True) if parts else frame
 
 
 def _of_most(frames: Scores) -> tuple[dict[str, pd.DataFrame], set[str]]:
@@ -446,7 +443,8 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     Those of `shown` have a look each; of the others, who are grey, those on the front have their name beside them.
     """
     names = those_there(rows, shown)
-    first = rows.iloc[0]
+    first, others = rows.iloc[0], len(rows) - len(names)
+    grey = f" Grey points: {counted(others, 'more matcher')}, named where on the front." if others else ""
     axes = [(name, label) for name, label in _PRICES.items() if np.isfinite(rows[name].to_numpy(float)).any()]
     about = BoardPage(
         title=f"Success against cost: {first['track']}, {prior_words(str(first['prior_group']))}",
@@ -455,7 +453,7 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             f"{counted(int(first['blocks']), 'block')}. Upright bars: 95 % intervals; level bars: from the median "
             "latency to the 95th percentile, all suites of the track. Grey line: the front, where no other matcher is "
             "both cheaper and "
-            f"better.{_others(rows, names)}{_left_out(rows)}"
+            f"better.{grey}{_left_out(rows)}"
         ),
         below="",
         columns=len(axes),
@@ -478,12 +476,6 @@ _PRICES: Final = {
     "latency_s": "latency of an answer (s), median to 95th percentile",
     "map_kb_per_km2": "map and index (kB for each km2)",
 }
-
-
-def _others(rows: pd.DataFrame, names: Sequence[str]) -> str:
-    """Return how many are drawn in grey."""
-    count = len(rows) - len(names)
-    return f" Grey points: {counted(count, 'more matcher')}, named where on the front." if count else ""
 
 
 def _left_out(rows: pd.DataFrame) -> str:

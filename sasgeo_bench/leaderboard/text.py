@@ -113,17 +113,12 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
     """
     if not verdicts:
         return ["Controls: none were drawn for this board, so nothing vouches for it (a pipeline draws them)."]
-    return [*_held_lines(verdicts), *_powerless_lines(verdicts)]
-
-
-def _powerless_lines(verdicts: Sequence[Verdict]) -> Iterator[str]:
-    """Yield how many controls could not have failed."""
     idle = sum(not item.can_fail for item in verdicts)
-    if idle:
-        yield (
-            f"{counted(idle, 'control')} could not fail: {'its' if idle == 1 else 'their'} queries are so few that "
-            f"guesses are right on all of them with a probability above {ALPHA:g}."
-        )
+    powerless = (
+        f"{counted(idle, 'control')} could not fail: {'its' if idle == 1 else 'their'} queries are so few that guesses "
+        f"are right on all of them with a probability above {ALPHA:g}."
+    )
+    return [*_held_lines(verdicts), *([powerless] if idle else [])]
 
 
 def _held_lines(verdicts: Sequence[Verdict]) -> list[str]:

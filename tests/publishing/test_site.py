@@ -397,7 +397,7 @@ def test_a_table_says_which_stress_it_counts_and_who_gave_no_sound_answer():
     scores.loc[2, "status"] = "timeout"
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {}}, scores=scores)
     (section,) = sections_of(book_of(given))
-    assert section.counted == "S1"
+    assert section.context.startswith("Stress that is counted: S1.")
     assert section.table.notes == (
         "One alone is ranked.",
         "Without a sound answer, which is a miss: graph 1 (timeout).",

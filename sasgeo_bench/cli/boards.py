@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.table import Table
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, RegionFolders, takes
@@ -20,13 +19,13 @@ from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.manifests import SeedRecord
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
-from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import (
     TERMINAL,
     Contents,
     control_lines,
     map_lines,
     segmenter_lines,
+    table_text,
     tables_of,
     warnings_of,
 )
@@ -301,10 +300,7 @@ def show_board(board: Board) -> None:
     kinds = tables_of(Contents(leaderboard=board.leaderboard, findings=board.findings), TERMINAL)
     for table in (one for tables in kinds.values() for one in tables if one.rows):
         say(table.title)
-        shown = Table(*(column.name for column in table.columns), box=None, pad_edge=False)
-        for row in table.rows:
-            shown.add_row(*map(text_of, row.cells))
-        print_table(shown)
+        print_table(table_text(table))
     for line in dict.fromkeys(note for table in kinds["risk"] for note in table.notes):
         say(line)
     for line in control_lines(board.verdicts):

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A leaderboard as Markdown, and as lines for a terminal; the parquet tables hold everything."""
+"""The tables of a board, listed with where they are shown, and a board as Markdown, LaTeX and lines for a terminal.
+
+A table is written by four functions: `table_text`, `table_markdown`, `table_latex`, and `table` of `parts.html`.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -8,6 +11,7 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import pandas as pd
+import rich.table
 
 from sasgeo_bench.errors import counted, named
 from sasgeo_bench.leaderboard.board_tables import (
@@ -325,6 +329,14 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
             "",
         )
     )
+
+
+def table_text(table: Table) -> rich.table.Table:
+    """Return a table for a terminal."""
+    shown = rich.table.Table(*(column.name for column in table.columns), box=None, pad_edge=False)
+    for row in table.rows:
+        shown.add_row(*map(text_of, row.cells))
+    return shown
 
 
 def table_markdown(table: Table) -> Iterator[str]:

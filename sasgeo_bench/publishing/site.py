@@ -14,7 +14,6 @@ from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import Book, sections_of
-from sasgeo_bench.leaderboard.cases import MEANINGS as FAILURE_MEANINGS
 from sasgeo_bench.leaderboard.manifests import FailedCase
 from sasgeo_bench.leaderboard.tables import MARKS, MEANINGS, NOTE, RANKS_NOTE, Table, file_stem, suite_card
 from sasgeo_bench.leaderboard.text import (
@@ -199,7 +198,7 @@ def _failures(site: Site) -> dict[str, object]:
     return {
         "groups": groups,
         "total": len(numbered),
-        "meanings_of": FAILURE_MEANINGS,
+        "meanings_of": OUTCOMES,
         "links": {number: _on_map(case) for number, case in numbered.items() if base_of(case.region) in mapped},
         "filters": [
             ("Matcher", "matcher", sorted({case.matcher for case in numbered.values()}), {}),

@@ -388,6 +388,14 @@ def disc_of(query: Query) -> tuple[float, float, float] | None:
     return None if center_m is None or radius_m is None or query.candidates else (*center_m, radius_m)
 
 
+def window_around(grid: Grid, middle_m: NDArray[np.float64], half_m: float) -> tuple[int, int, int, int]:
+    """Return row, column, rows and columns of a square around a point, as far as the map reaches."""
+    ends = grid.to_cells(middle_m + half_m * np.array([(-1.0, 1.0), (1.0, -1.0)]))
+    row, col = np.clip(ends[0], 0, [grid.rows - 1, grid.cols - 1]).tolist()
+    end_row, end_col = np.clip(ends[1] + 1, [row + 1, col + 1], [grid.rows, grid.cols]).tolist()
+    return (row, col, end_row - row, end_col - col)
+
+
 def seen_at(pose: Pose, view: Evidence, layers: LayerBits, grid: Grid, manifest: Manifest) -> Evidence:
     """Return the map at a place as a view of the size and classes of `view`."""
     cells = observe(layers, grid, pose, size_cells=view.shape[0], cell_size_m=view.cell_size_m)
@@ -648,10 +656,7 @@ def _window(query: Query, grid: Grid) -> tuple[int, int, int, int]:
     if disc is None:
         return (0, 0, grid.rows, grid.cols)
     half_m = _ROOM * (disc[2] + float(np.hypot(*query.evidence.size_m)) / 2)
-    ends = grid.to_cells(np.array(disc[:2]) + half_m * np.array([(-1.0, 1.0), (1.0, -1.0)]))
-    row, col = np.clip(ends[0], 0, [grid.rows - 1, grid.cols - 1]).tolist()
-    end_row, end_col = np.clip(ends[1] + 1, [row + 1, col + 1], [grid.rows, grid.cols]).tolist()
-    return (row, col, end_row - row, end_col - col)
+    return window_around(grid, np.array(disc[:2]), half_m)
 
 
 def _keys(case: CasePicture, region: Region) -> list[Artist]:

@@ -21,6 +21,7 @@ from sasgeo_bench.leaderboard.cases import (
     find_cases,
     operating_rejector,
     seen_at,
+    window_around,
     words_of,
 )
 from sasgeo_bench.matching.matcher import SAME_PLACE_M, Prediction
@@ -160,11 +161,7 @@ def _window(case: Case, grid: Grid) -> tuple[int, int, int, int]:
     places = np.array([(pose.easting_m, pose.northing_m) for pose in poses])
     span_m = float(np.ptp(places, axis=0).max()) + math.sqrt(2.0) * side_m
     half_m = max(_ROOM * span_m, _LEAST_SIDES * side_m) / 2
-    middle_m = (places.min(axis=0) + places.max(axis=0)) / 2
-    corners = grid.to_cells(middle_m + half_m * np.array([(-1.0, 1.0), (1.0, -1.0)]))
-    row, col = np.clip(corners[0], 0, [grid.rows - 1, grid.cols - 1]).tolist()
-    end_row, end_col = np.clip(corners[1] + 1, [row + 1, col + 1], [grid.rows, grid.cols]).tolist()
-    return (row, col, end_row - row, end_col - col)
+    return window_around(grid, (places.min(axis=0) + places.max(axis=0)) / 2, half_m)
 
 
 def _title(case: Case) -> str:

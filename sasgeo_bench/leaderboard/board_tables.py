@@ -4,7 +4,7 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
@@ -424,16 +424,15 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
 AT_MOST: Final = "at most"  # the line of the ceiling
 
 
-def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
-    """Yield who is good at what, of some suites or of all: a matcher a line, a suite a column, figure and rank.
+def summary(book: Book) -> Iterator[Table]:
+    """Yield who is good at what: a matcher a line, a suite a column, figure and rank.
 
     Columns of false fixes at absent places follow those of the suites. The first lines say of each suite how many
     queries count, what can be reached and what guessing and the controls reach. Suites with more ranked matchers come
     first, so do matchers that were asked about more of them. A cell leads where its rank may be the first of several.
     """
-    asked = [key for key in book.matchers if not suites or key[0] in suites]
-    for group in sorted({key[1:] for key in asked}):
-        yield _overview(book, [key for key in asked if key[1:] == group])
+    for group in sorted({key[1:] for key in book.matchers}):
+        yield _overview(book, [key for key in book.matchers if key[1:] == group])
 
 
 def _overview(book: Book, keys: Sequence[Key]) -> Table:

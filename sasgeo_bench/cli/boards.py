@@ -22,7 +22,7 @@ from sasgeo_bench.leaderboard.manifests import SeedRecord
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
 from sasgeo_bench.leaderboard.tables import text_of
-from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, warnings_of
+from sasgeo_bench.leaderboard.text import control_lines, map_lines, metric_lines, segmenter_lines, warnings_of
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.archive_file import is_pack
@@ -58,6 +58,10 @@ Rejectors = Annotated[
         help="name from list rejectors, or module:Class; may be repeated; default: none, or those of stored results"
     ),
 ]
+Metrics = Annotated[
+    list[str] | None,
+    typer.Option(help="one more than every board has: a name from list metrics, or module:NAME; may be repeated"),
+]
 Submissions = Annotated[
     list[Path] | None,
     typer.Option(help="a submission, or a folder of them, for stored results; those for their board are scored"),
@@ -91,6 +95,7 @@ class ScoreOptions(Options):
         ),
     ] = None
     rejector: Rejectors = None
+    metric: Metrics = None
     submissions: Submissions = None
     private: Private = None
     region_files: RegionFolders = None
@@ -146,6 +151,7 @@ def score(options: ScoreOptions) -> Board:
     request = replace(
         usual,
         tasks=options.tasks or (),
+        metrics=options.metric or (),
         truth=options.truth,
         draws=options.draws or usual.draws,
         without=options.without or (),
@@ -303,5 +309,5 @@ def show_board(board: Board) -> None:
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
-    for line in (*map_lines(board.about), *warnings_of(board.leaderboard)):
+    for line in (*map_lines(board.about), *warnings_of(board.leaderboard), *metric_lines(board.about)):
         tell(line)

@@ -33,6 +33,7 @@ from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.entries import design_rows, rows_to_rank
+from sasgeo_bench.scoring.metric_plugins import find_metrics
 from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.sensing.reference_imagery import render_place
@@ -646,14 +647,15 @@ def run_pipeline(
     `results` is a folder to store the board in, with the answers and truths it was made of, as <id>/. `has_cases` shows
     failed queries with their truths on the board. `private` is the board of a private seed of this pipeline, which the
     rows are compared with. `opened` is the day on which sealed places are opened, today unless given. Raise
-    `ConfigError` if no region can carry any of the suites, or all that could be ranked is sealed; `StoreError` if the
-    board cannot be stored in `results`, or `ConfigError` if two rejectors share a name, before anything is done; and as
-    `pack_board` does after the board is written.
+    `ConfigError` if no region can carry any of the suites, or all that could be ranked is sealed; before anything is
+    done `StoreError` if the board cannot be stored in `results`, `ConfigError` if two rejectors share a name, or
+    `MatchError` if a metric cannot be found; and as `pack_board` does after the board is written.
     """
     stored = None if results is None else results / plan.spec.id
     if stored is not None:
         check_results(stored, board_folder(plan))
     rules_of(plan.spec.rejectors, plan.split)
+    find_metrics(plan.spec.metrics)
     sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored)
     tasks, controls = draw_all(plan)
     asked = [task for task in tasks if not is_train(plan, base_of(task.name))]
@@ -671,6 +673,7 @@ def run_pipeline(
         board=board_folder(plan),
         split=plan.split,
         rejectors=plan.spec.rejectors,
+        metrics=plan.spec.metrics,
         contrasts=contrasts,
         draws=plan.spec.draws,
         pipeline=plan.spec.identity,

@@ -4,13 +4,13 @@
 import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.manifests import BoardEntry
+from sasgeo_bench.leaderboard.manifests import BoardEntry, MetricRecord
 from sasgeo_bench.leaderboard.private_board import SEEDS_NOTE
 from sasgeo_bench.leaderboard.tables import (
     FEW,
@@ -77,9 +77,9 @@ MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1
 class Book:
     """Figures of a board that take every answer, by entry and queries; and the names of the pages that show them.
 
-    `controls` are the entries that are never ranked. `counted` names the kinds and steps of stress that the
-    first figure of a table counts, `lost` the entries without a sound answer, and how often; both are empty without
-    scored queries.
+    `controls` are the entries that are never ranked, `metrics` those of other packages by name. `counted` names the
+    kinds and steps of stress that the first figure of a table counts, `lost` the entries without a sound answer, and
+    how often; both are empty without scored queries.
     """
 
     figures: Mapping[tuple[str, ...], Record]
@@ -91,10 +91,18 @@ class Book:
     suite_pages: Mapping[str, str]
     counted: Mapping[Key, str]
     lost: Mapping[Key, str]
+    metrics: Mapping[str, MetricRecord] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, board: pd.DataFrame, listed: Sequence[BoardEntry] = (), scores: pd.DataFrame | None = None) -> Self:
-        """Index a leaderboard with its entries, which may be listed, and its scored queries."""
+    def of(
+        cls,
+        board: pd.DataFrame,
+        listed: Sequence[BoardEntry] = (),
+        scores: pd.DataFrame | None = None,
+        *,
+        metrics: Sequence[MetricRecord] = (),
+    ) -> Self:
+        """Index a leaderboard with its entries, which may be listed, its scored queries and metrics of others."""
         entries = {entry.name: entry for entry in listed}
         for row in records_of(board.drop_duplicates("matcher")) if "set_apart" in board else ():
             reason: str | None = None if pd.isna(row["set_apart"]) else row["set_apart"]
@@ -122,6 +130,7 @@ class Book:
             suite_pages=page_names("suite", [suite for suite, _, _ in sorted(matchers)]),
             counted={key: _counted(rows) for key, rows in _by_group(scored)},
             lost={key: _lost(rows) for key, rows in _by_group(scored)},
+            metrics={one.name: one for one in metrics},
         )
 
     def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
@@ -131,6 +140,19 @@ class Book:
     def main(self, key: Key, matcher: str, metric: str) -> Record | None:
         """Return the figure under stress, or of all queries where nothing is stressed."""
         return self.pick(key, matcher, metric, STRESS) or self.pick(key, matcher, metric)
+
+    def besides(self, track: str) -> tuple[str, ...]:
+        """Return the figures that a table shows beside the primary one, of the same queries."""
+        own = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
+        return (*own, *(name for name, one in self.metrics.items() if track in one.tracks))
+
+    def column(self, term: str, *, order: str = "none") -> Column:
+        """Return the column of a term, which may be a metric of another package."""
+        metric, plain = self.metrics.get(term), column(term, order=order)
+        if metric is None:
+            return plain
+        unit = "" if metric.unit == "1" else f" ({metric.unit})"
+        return replace(plain, name=f"{term}{unit}", meaning=metric.to_text())
 
     def name_cell(self, matcher: str) -> Cell:
         """Return the name of a matcher with its marks and a link to its page."""
@@ -252,23 +274,19 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     tie_of = {name: number for number, tie in enumerate(ties) for name in tie.names}
     ranked = sum(not pd.isna(row["rank_best"]) for row in found.values())
     rows = tuple(_row(book, key, found[name], tie_of.get(name), ranked) for name in order)
-    titles = (primary, "rank", *_besides(track), "control", "false fixes", "detectable", "n", "missing", "blocks")
+    besides = book.besides(track)
+    titles = (primary, "rank", *besides, "control", "false fixes", "detectable", "n", "missing", "blocks")
     table = Table(
         name=file_stem("board", suite, track, prior_group),
         title=f"{suite}: {track}, {prior_words(prior_group)}",
         columns=(
             column("matcher", is_number=False),
-            *(column(name, order="descending" if name == primary else "none") for name in titles),
+            *(book.column(name, order="descending" if name == primary else "none") for name in titles),
         ),
         rows=rows,
         notes=_notes(book, ties, found, ranked),
     )
-    return table.without_empty(*_besides(track), "false fixes", "control", "detectable", "missing")
-
-
-def _besides(track: str) -> tuple[str, ...]:
-    """Return the figures that a table shows beside the primary one, of the same queries."""
-    return _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
+    return table.without_empty(*besides, "false fixes", "control", "detectable", "missing")
 
 
 def _value(row: Record) -> float:
@@ -287,7 +305,7 @@ def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Ro
             book.name_cell(name),
             figure_cell(main, has_bar=True),
             rank_cell(main, ranked=ranked, mark=mark),
-            *(figure_cell(book.pick(key, name, metric, stratum)) for metric in _besides(key[1])),
+            *(figure_cell(book.pick(key, name, metric, stratum)) for metric in book.besides(key[1])),
             figure_cell(book.pick(key, name, primary, CONTROL)),
             figure_cell(book.pick(key, name, FALSE_ABSENT.name)),
             number_cell(float(main["detectable"])),

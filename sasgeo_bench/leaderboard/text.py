@@ -19,7 +19,7 @@ from sasgeo_bench.leaderboard.board_tables import (
     sections_of,
     seed_table,
 )
-from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardManifest
+from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardManifest, MetricRecord
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.tables import DAGGER, NOTE, RANKS_NOTE, TERMS, Table, text_of
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
@@ -168,6 +168,11 @@ def segmenter_lines(about: BoardManifest) -> list[str]:
     ]
 
 
+def metric_lines(about: BoardManifest) -> list[str]:
+    """Return which metrics are of other packages, and whose code they are."""
+    return [f"{one.name}: {one.to_text()}." for one in about.metrics]
+
+
 def tables_of(
     board: pd.DataFrame,
     entries: Sequence[BoardEntry] = (),
@@ -175,12 +180,13 @@ def tables_of(
     falsifiers: Sequence[Falsifier] = (),
     verdicts: Sequence[Verdict] = (),
     others: Sequence[Table] = (),
+    metrics: Sequence[MetricRecord] = (),
 ) -> Iterator[Table]:
     """Yield the tables of a board in the order of its pages; those without a row are left out.
 
-    `others` are the tables of absence and of steps.
+    `others` are the tables of absence and of steps, `metrics` those of other packages.
     """
-    book = Book.of(board, entries)
+    book = Book.of(board, entries, metrics=metrics)
     suites = [
         table
         for section in sections_of(book)
@@ -204,7 +210,7 @@ def tables_of(
 
 def board_markdown(board: pd.DataFrame, about: BoardManifest, **more: Any) -> str:  # noqa: ANN401 - see tables_of
     """Return the board as a document; arguments as of `tables_of`."""
-    tables = list(tables_of(board, about.entries, **more))
+    tables = list(tables_of(board, about.entries, metrics=about.metrics, **more))
     lines = [
         *control_lines(more.get("verdicts", ())),
         *seed_lines(about),
@@ -213,6 +219,7 @@ def board_markdown(board: pd.DataFrame, about: BoardManifest, **more: Any) -> st
         *warnings_of(board),
         *training_lines(about),
         *segmenter_lines(about),
+        *metric_lines(about),
         *(f"Failed, and not on this board: {name}: {why}" for name, why in about.failed.items()),
     ]
     columns = {column.term: column.meaning for table in tables for column in table.columns}
@@ -269,7 +276,7 @@ _HEAD: Final = (
 def board_latex(board: pd.DataFrame, about: BoardManifest, **more: Any) -> str:  # noqa: ANN401 - see tables_of
     """Return the tables of a board for a paper, which needs the package booktabs; arguments as of `text.tables_of`."""
     head = f"% {tex(about.made_by or '?')}, scorer version {about.scorer_version}; {ATTRIBUTION}"
-    tables = tables_of(board, about.entries, **more)
+    tables = tables_of(board, about.entries, metrics=about.metrics, **more)
     return "\n".join((head, *_HEAD, *(line for table in tables for line in _lines(table)))) + "\n"
 
 

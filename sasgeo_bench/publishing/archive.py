@@ -216,6 +216,11 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
     with scratch_folder("answers") as folder:
         found = unpack(stored, folder)
         others = [path for path in request.predictions if path != stored]
+        kept = read_board_manifest(stored)
+        lost = [one for one in kept.metrics if one.spec not in request.metrics]
+        if lost:
+            flags = " ".join(f"--metric {one.spec}" for one in lost)
+            tell(f"{stored} has metrics of other packages, which are left out here: {flags} adds them")
         with _attributed(stored, found.root):
             yield replace(
                 request,
@@ -223,7 +228,7 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
                 tasks=found.tasks,
                 root=found.root,
                 truth=found.root / "truth",
-                kept=read_board_manifest(stored),
+                kept=kept,
             )
 
 

@@ -253,7 +253,8 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     Pages refer to other hosts only by links, and each can be read without the script.
     """
     templates = environment()
-    book = Book.of(source.board.leaderboard, source.board.about.entries, source.board.scores)
+    about = source.board.about
+    book = Book.of(source.board.leaderboard, about.entries, source.board.scores, metrics=about.metrics)
     maps = place_maps(source)
     scenes = tuple(scene_tables(source.scenes, book)) if len(source.scenes) else ()
     rejection = rejection_tables(source.board.leaderboard)
@@ -271,7 +272,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     kinds = figures_by_kind(source.figures)
     common: dict[str, Any] = {
         "source": source,
-        "about": source.board.about,
+        "about": about,
         "book": book,
         "there": there,
         "navigation": [(name, _NAMES[name]) for name in there],
@@ -298,7 +299,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "method.html": {
             "controls": control_table(source.board.verdicts),
             "learned": [*training_lines(source.board.about), *segmenter_lines(source.board.about)],
-            "meanings": MEANINGS | MARKS,
+            "meanings": MEANINGS | {one.name: one.to_text() for one in about.metrics} | MARKS,
         },
     }
     pages = {name: _render(templates, name, name, common | special[name]) for name in there}

@@ -55,9 +55,7 @@ def _tried(spec: str) -> Ladder:
     except (Exception, SystemExit) as error:  # whatever code of somebody's own raises
         raise MatchError(f"{spec}: it cannot be made with {word} ({message_of(error)})") from error
     if not callable(made):
-        raise MatchError(
-            f"{spec}: it makes an object of type {type(made).__name__} with {word}, which cannot be called"
-        )
+        raise MatchError(f"{spec}: with {word} it makes an object of type {type(made).__name__}, no callable")
     return ladder
 
 

@@ -153,7 +153,7 @@ def stop(_):
         (Stripes(share=0.0), "its share is 0, at which it changes nothing: name it at a usual strength"),
         (lambda strength: strength / 0, "it cannot be made with strength 0.3 (ZeroDivisionError"),
         (stop, "it cannot be made with _ 0.3 (SystemExit"),
-        (lambda strength: str(strength), "it makes an object of type str with strength 0.3, which cannot be called"),
+        (lambda strength: [strength], "with strength 0.3 it makes an object of type list, no callable"),
     ],
 )
 def test_what_is_no_perturbation_is_refused_in_one_line(named, one, fault):

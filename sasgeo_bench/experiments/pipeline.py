@@ -402,9 +402,10 @@ def plan_pipeline(
     serve regions that are not built yet, and files of one's own. `private` draws all queries instead of the file's
     seed, below `out/private`. `sealed` draws the sealed places of the split, which are left out without it. Raise
     `ConfigError` for an unknown suite, region or split, or if no region can be built here, or learned from, or ranked;
-    `MatchError` for an unknown matcher or rejector.
+    `MatchError` for an unknown matcher, rejector or metric.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
+    find_metrics(spec.metrics)
     experiment = find_experiment(spec)
     out, seed = root_of(out, private), private or spec.seed
     requests: list[Request] = []
@@ -647,15 +648,14 @@ def run_pipeline(
     `results` is a folder to store the board in, with the answers and truths it was made of, as <id>/. `has_cases` shows
     failed queries with their truths on the board. `private` is the board of a private seed of this pipeline, which the
     rows are compared with. `opened` is the day on which sealed places are opened, today unless given. Raise
-    `ConfigError` if no region can carry any of the suites, or all that could be ranked is sealed; before anything is
-    done `StoreError` if the board cannot be stored in `results`, `ConfigError` if two rejectors share a name, or
-    `MatchError` if a metric cannot be found; and as `pack_board` does after the board is written.
+    `ConfigError` if no region can carry any of the suites, or all that could be ranked is sealed; `StoreError` if the
+    board cannot be stored in `results`, or `ConfigError` if two rejectors share a name, before anything is done; and as
+    `pack_board` does after the board is written.
     """
     stored = None if results is None else results / plan.spec.id
     if stored is not None:
         check_results(stored, board_folder(plan))
     rules_of(plan.spec.rejectors, plan.split)
-    find_metrics(plan.spec.metrics)
     sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored)
     tasks, controls = draw_all(plan)
     asked = [task for task in tasks if not is_train(plan, base_of(task.name))]

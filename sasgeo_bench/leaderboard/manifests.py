@@ -204,13 +204,13 @@ class RejectorRecord(Record):
 
 
 class MetricRecord(Record):
-    """A metric of another package: what tables show of it, and whose code it is, with its SHA-256.
+    """A metric of another package: what tables show of it, and its `code`, as module:NAME, with its SHA-256.
 
     A bound that is missing is infinite.
     """
 
     name: str
-    spec: str
+    code: str
     sha256: Sha256
     meaning: str
     source: str
@@ -224,7 +224,7 @@ class MetricRecord(Record):
         """Return in a line what it says, of what, and whose it is."""
         least, greatest = ("any" if end is None else f"{end:g}" for end in (self.least, self.greatest))
         unit = "" if self.unit == "1" else f" {self.unit}"
-        whose = f"a metric of {self.spec} (code {self.sha256[:12]}), not of sasgeo-bench"
+        whose = f"a metric of {self.code} ({self.sha256[:12]}), not of sasgeo-bench"
         said = f"{self.meaning.removesuffix('.')}. {self.better.capitalize()} is better, {least} to {greatest}{unit}"
         return f"{said}; {whose}"
 

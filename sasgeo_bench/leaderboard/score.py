@@ -61,7 +61,6 @@ from sasgeo_bench.scoring.entries import (
     scored_rows,
     set_apart,
 )
-from sasgeo_bench.scoring.metric import MeanMetric
 from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metrics, measured
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA, protection_frame
 from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, Rule, evaluate_rejectors, rules_of
@@ -111,7 +110,7 @@ def score_board(request: ScoreRequest) -> Scored:
             tasks,
             records,
             private=on_private.seed,
-            plugins=([rule.card for rule in rules.values()], [_metric_of(*item) for item in metrics]),
+            plugins=([rule.card for rule in rules.values()], [_metric_of(item) for item in metrics]),
             remarks=rejection.remarks,
             failed=failures.found,
         ),
@@ -389,12 +388,13 @@ def _record_of(
     )
 
 
-def _metric_of(spec: str, metric: MeanMetric, sha256: str) -> MetricRecord:
+def _metric_of(found: ForeignMetric) -> MetricRecord:
     """Return what a board says of a metric of another package."""
+    metric = found.metric
     least, greatest = (float(end) if math.isfinite(end) else None for end in metric.bounds)
     words = {name: getattr(metric, name) for name in ("name", "meaning", "source", "unit", "better")}
     tracks = list(metric.tracks)
-    return MetricRecord(**words, spec=spec, sha256=sha256, least=least, greatest=greatest, tracks=tracks)
+    return MetricRecord(**words, code=found.code, sha256=found.sha256, least=least, greatest=greatest, tracks=tracks)
 
 
 def _entry_of(entry: Entry, set_apart: str | None, on_private: OnPrivate, controls: Sequence[Verdict]) -> BoardEntry:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import check_registered
+from sasgeo_bench.files.plugins import METRICS, check_registered, code_of
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
 from sasgeo_bench.leaderboard.build import drawings, make_board
 from sasgeo_bench.leaderboard.manifests import PackManifest
@@ -217,9 +217,10 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
         found = unpack(stored, folder)
         others = [path for path in request.predictions if path != stored]
         kept = read_board_manifest(stored)
-        lost = [one for one in kept.metrics if one.spec not in request.metrics]
+        named = {":".join(code_of(spec, METRICS)) for spec in request.metrics}
+        lost = [one.code for one in kept.metrics if one.code not in named]
         if lost:
-            flags = " ".join(f"--metric {one.spec}" for one in lost)
+            flags = " ".join(f"--metric {one}" for one in lost)
             tell(f"{stored} has metrics of other packages, which are left out here: {flags} adds them")
         with _attributed(stored, found.root):
             yield replace(

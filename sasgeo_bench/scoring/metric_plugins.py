@@ -13,7 +13,7 @@ import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError
 from sasgeo_bench.files.plugins import METRICS as GROUP
-from sasgeo_bench.files.plugins import check_own_name, find_inside, list_entry_points, plugin_code
+from sasgeo_bench.files.plugins import check_own_name, code_of, find_inside, list_entry_points, plugin_code
 from sasgeo_bench.matching.scaffold import package_files
 from sasgeo_bench.progress import tell
 from sasgeo_bench.scoring.base import Bools, Floats
@@ -34,6 +34,11 @@ class ForeignMetric(NamedTuple):
     spec: str
     metric: MeanMetric
     sha256: str
+
+    @property
+    def code(self) -> str:
+        """Return where its code is, as module:NAME."""
+        return ":".join(code_of(self.spec, GROUP))
 
 
 def list_metrics() -> tuple[str, ...]:

@@ -12,6 +12,7 @@ import pytest
 import sasgeo_bench as sgb
 from sasgeo_bench.config import ConfigError
 from sasgeo_bench.errors import MatchError, MetricError
+from sasgeo_bench.experiments.pipeline import plan_pipeline
 from sasgeo_bench.files.plugins import plugin_code
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.progress import reporting
@@ -65,10 +66,10 @@ def test_it_has_rows_a_column_and_a_name_and_the_board_lives_without_it(answered
     assert 0.0 <= values["prior_centre"] < 0.5
 
     (about,) = json.loads((board.folder / "board.json").read_text())["metrics"]
-    assert (about["spec"], about["sha256"]) == (SPEC, plugin_code(SPEC))
+    assert (about["code"], about["sha256"]) == (SPEC, plugin_code(SPEC))
     assert {"name", "meaning", "unit", "better", "least", "greatest", "tracks", "source"} < set(about)
     assert "metrics" not in json.loads((answered / "boards" / "plain" / "board.json").read_text())
-    whose = f"a metric of {SPEC} (code {about['sha256'][:12]}), not of sasgeo-bench"
+    whose = f"a metric of {SPEC} ({about['sha256'][:12]}), not of sasgeo-bench"
     for name in ("leaderboard.md", "leaderboard.tex"):
         assert "nearness" in (board.folder / name).read_text()
     text = (board.folder / "leaderboard.md").read_text()
@@ -121,11 +122,12 @@ task = [{suites = ["clean"], sites = 2}]
 """
 
 
-def test_a_pipeline_file_may_name_metrics_and_keeps_its_hash_without_any():
+def test_a_pipeline_file_may_name_metrics_and_keeps_its_hash_without_any(tmp_path):
     plain = PipelineFile.model_validate(tomllib.loads(PIPELINE))
     empty = PipelineFile.model_validate(tomllib.loads(PIPELINE.replace("task", "metrics = []\ntask")))
     more = PipelineFile.model_validate(tomllib.loads(PIPELINE.replace("task", f'metrics = ["{SPEC}"]\ntask')))
     assert plain.sha256 == empty.sha256 != more.sha256
-    assert more.metrics == [SPEC]
+    with pytest.raises(MatchError, match=f"^{SPEC}: cannot be imported"):
+        plan_pipeline(more, out=tmp_path)
     with pytest.raises((ValueError, ConfigError), match=f"metric '{SPEC}' is listed twice"):
         PipelineFile.model_validate(tomllib.loads(PIPELINE) | {"metrics": [SPEC, SPEC]})

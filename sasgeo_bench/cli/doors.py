@@ -4,7 +4,7 @@
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import StrEnum
 from importlib import import_module
@@ -138,8 +138,6 @@ def list_command(
         _list_suites()
     elif kind is Listed.METRICS:
         _list_metrics()
-    elif kind is Listed.PERTURBATIONS:
-        _list_perturbations()
     else:
         _list(kind.removesuffix("s"), door)
 
@@ -154,6 +152,11 @@ def _list(kind: str, door: _Door) -> None:
         name: (point.dist.name if point.dist is not None else "", point.value)
         for name, point in list_entry_points(door.group).items()
     }
+    if kind == "perturbation":
+        from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED  # noqa: PLC0415
+
+        ours = {name: type(one) for name, one in SHIPPED.items()}
+        rows |= {name: ("sasgeo-bench", f"{one.__module__}:{one.__name__}") for name, one in ours.items()}
     if door.control:
         rows[door.control] = ("sasgeo-bench", "a control, given the truth")
     table = Table(kind, "package", "class", box=None, pad_edge=False)
@@ -184,42 +187,32 @@ def _list_regions(folders: Iterable[Path] | None) -> None:
 def _list_suites() -> None:
     from sasgeo_bench.tasks.suites.all_suites import find_suite, list_suites  # noqa: PLC0415
 
-    table = Table("suite", "title", "tracks", "per site", "separates", box=None, pad_edge=False)
-    for name in list_suites():
-        try:
-            suite = find_suite(name)
-        except ConfigError as error:  # of another package: the others are listed all the same
-            tell(f"left out: {error}")
-            continue
+    def row(name: str) -> tuple[str, ...]:
+        suite = find_suite(name)
         per_site = sum(len(suite.tracks(variant)) for variant in suite.variants)
-        table.add_row(name, suite.card.title, ", ".join(suite.card.tracks), str(per_site), suite.card.separates)
-    print_table(table)
+        return suite.card.title, ", ".join(suite.card.tracks), str(per_site), suite.card.separates
+
+    _list_rows(("suite", "title", "tracks", "per site", "separates"), list_suites(), row)
 
 
 def _list_metrics() -> None:
     from sasgeo_bench.scoring.metric_plugins import find_metric, list_metrics  # noqa: PLC0415
 
-    table = Table("metric", "unit", "better", "bounds", "what it says", box=None, pad_edge=False)
-    for name in list_metrics():
+    def row(name: str) -> tuple[str, ...]:
+        one = find_metric(name)
+        return one.unit, one.better, "{:g} to {:g}".format(*one.bounds), one.meaning
+
+    _list_rows(("metric", "unit", "better", "bounds", "what it says"), list_metrics(), row)
+
+
+def _list_rows(heads: Sequence[str], names: Iterable[str], row: Callable[[str], tuple[str, ...]]) -> None:
+    """Print a row for each name; what another package does not hold is told, and the others are listed all the same."""
+    table = Table(*heads, box=None, pad_edge=False)
+    for name in names:
         try:
-            metric = find_metric(name)
-        except MatchError as error:  # as in _list_suites
+            table.add_row(name, *row(name))
+        except (ConfigError, MatchError) as error:
             tell(f"left out: {error}")
-            continue
-        table.add_row(name, metric.unit, metric.better, "{:g} to {:g}".format(*metric.bounds), metric.meaning)
-    print_table(table)
-
-
-def _list_perturbations() -> None:
-    from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED  # noqa: PLC0415
-
-    table = Table("perturbation", "package", "class", box=None, pad_edge=False)
-    for name, one in SHIPPED.items():
-        kind = type(one)
-        table.add_row(name, "sasgeo-bench", f"{kind.__module__}:{kind.__name__}")
-    for name, point in list_entry_points(PERTURBATIONS).items():
-        if name not in SHIPPED:
-            table.add_row(name, point.dist.name if point.dist is not None else "", point.value)
     print_table(table)
 
 

@@ -2,7 +2,7 @@
 """The conformance kit of perturbations: what each promises, checked on views of a small town."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from sasgeo_bench.errors import MatchError, PerturbError
 from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
-from sasgeo_bench.running.testing import Check, check_of, tiny_place
+from sasgeo_bench.running.testing import Check, tiny_place, tried
 from sasgeo_bench.tasks.perturbations.all_perturbations import Ladder, find_perturbation, ladder_of
 from sasgeo_bench.tasks.perturbations.base import Perturbation
 from sasgeo_bench.texts import message_of, one_line
@@ -83,23 +83,21 @@ class _Kit:
     def checks(self) -> Iterator[Check]:
         """Try every rule in turn."""
         moves = getattr(self.perturbation, "moves_cells", False)
-        rules: tuple[tuple[str, Callable[[], str | None]], ...] = (
-            ("gives a view of the same classes and shape", self.keeps_shape),
-            ("changes no cell at strength 0", self.is_neutral),
-            ("the same seed, the same view", self.repeats),
-            ("the given view is not changed", self.leaves_input),
-            ("cells move, and nothing appears" if moves else "unknown cells stay unknown", self.adds_nothing),
-            ("a class more changes no other one", self.draws_by_class),
-            ("takes views of one class, and of any shape", self.takes_any),
-            ("changes some cells", self.acts),
-            ("refuses what is no strength", self.refuses),
+        kept = "cells move, and nothing appears" if moves else "unknown cells stay unknown"
+        found = f"{len(self.views)} views"
+        yield from tried(
+            (
+                ("gives a view of the same classes and shape", self.keeps_shape, found),
+                ("changes no cell at strength 0", self.is_neutral, found),
+                ("the same seed, the same view", self.repeats, found),
+                ("the given view is not changed", self.leaves_input, found),
+                (kept, self.adds_nothing, found),
+                ("a class more changes no other one", self.draws_by_class, found),
+                ("takes views of one class, and of any shape", self.takes_any, found),
+                ("changes some cells", self.acts, found),
+                ("refuses what is no strength", self.refuses, found),
+            )
         )
-        for rule, check in rules:
-            try:
-                fault = check()
-            except (Exception, SystemExit) as error:  # of code of somebody's own  # noqa: BLE001
-                fault = message_of(error)
-            yield check_of(rule, fault, f"{len(self.views)} views")
 
     @property
     def perturbation(self) -> Perturbation:

@@ -62,7 +62,7 @@ class Ladder:
 def find_perturbation(spec: str) -> object:
     """Return what a name, or "module:NAME", stands for: a perturbation at a usual strength, or what makes one of it.
 
-    Raise `MatchError` if there is none, with the nearest name, or it cannot be imported.
+    Raise `MatchError` if there is none, with the nearest name, it cannot be imported, or is no perturbation.
 
     >>> find_perturbation("border")
     Border(share=0.3)
@@ -72,7 +72,9 @@ def find_perturbation(spec: str) -> object:
     sasgeo_bench.errors.MatchError: there is no perturbation 'boarder', did you mean 'border'? (list perturbations shows
     all; or module:NAME)
     """
-    return SHIPPED[spec] if spec in SHIPPED else find_inside(spec, GROUP, shipped=SHIPPED)
+    found = SHIPPED[spec] if spec in SHIPPED else find_inside(spec, GROUP, shipped=SHIPPED)
+    ladder_of(found, spec)
+    return found
 
 
 def ladder_of(found: object, spec: str) -> Ladder:

@@ -357,7 +357,7 @@ def find_plugin(spec: str, group: str) -> Any:  # noqa: ANN401 - any plugin
         raise _failed(one_line(spec), "cannot be imported", error) from error
 
 
-_NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")  # of what runs inside the program
+NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")  # of what runs inside the program
 
 
 def find_inside(spec: str, group: str, *, shipped: Collection[str]) -> Any:  # noqa: ANN401 - any plugin
@@ -377,7 +377,7 @@ def check_own_name(spec: str, name: object, group: str, *, shipped: Collection[s
 
     `where` is what says the name.
     """
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
+    if not isinstance(name, str) or not NAME.fullmatch(name):
         raise MatchError(f"{spec}: {where} is named {name!r}: lower-case letters, digits, - and _ make a name")
     if name in shipped:
         raise MatchError(f"{spec}: {where} is named {name!r}, as a {KINDS[group]} that ships: rename it")

@@ -14,6 +14,7 @@ from sasgeo_bench.files.plugins import (
     CARD_FILE,
     KINDS,
     MATCHERS,
+    NAME,
     PERTURBATIONS,
     SEGMENTERS,
     SUITES,
@@ -24,7 +25,6 @@ from sasgeo_bench.matching.submission import EXAMPLE
 from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
-_NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
 _LONGEST: Final = 60
 # Modules that a package of this name would hide: of Python, of this package and its imports, and of common tools.
 _TAKEN: Final = frozenset(
@@ -196,9 +196,9 @@ def _words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, 
     # The class is called as none of the `imported` names is. Raise `ConfigError` if the name is not allowed, or taken.
     kind = KINDS[group]
     module = name.replace("-", "_")
-    if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
+    if NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
         raise ConfigError(f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name")
-    if not _NAME.fullmatch(name):
+    if not NAME.fullmatch(name):
         raise ConfigError(
             f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, a letter first, as in "
             f"my-{kind}; got {name!r}"

@@ -97,7 +97,8 @@ def _silence(metric: MeanMetric) -> str | None:
     blank = next((name for name in ("meaning", "unit", "source") if not _is_line(getattr(metric, name))), None)
     bounds = metric.bounds if isinstance(metric.bounds, tuple | list) else ()
     are_bounds = len(bounds) == 2 and all(isinstance(end, Real) for end in bounds) and bounds[0] < bounds[1]
-    are_tracks = isinstance(metric.tracks, tuple | list) and bool(metric.tracks) and {*metric.tracks} <= {*TRACKS}
+    tracks = metric.tracks if isinstance(metric.tracks, tuple | list) else ()
+    are_tracks = bool(tracks) and all(track in TRACKS for track in tracks)
     faults = {
         f"it is named {metric.name!r}, as a column of boards: rename it": metric.name in _COLUMNS,
         f"its {blank} is {getattr(metric, str(blank), '')!r}, expected a line of text": blank is not None,

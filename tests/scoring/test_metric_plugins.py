@@ -3,7 +3,9 @@
 
 import dataclasses
 import math
+import re
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -63,6 +65,7 @@ def named(monkeypatch):
         (metric(bounds=(math.nan, 1.0)), "bounds are (nan, 1.0), expected"),
         (metric(bounds="01"), "bounds are '01', expected"),
         (metric(tracks=("flights",)), "tracks are ('flights',), expected some of"),
+        (metric(tracks=[["localization"]]), "tracks are [['localization']], expected some of"),
         (metric(tracks="localization"), "tracks are 'localization', expected some of"),
         (metric(is_primary=True), "is_primary is true"),
         (metric(values=0.5), "values is no function of scored rows"),
@@ -230,6 +233,14 @@ def test_the_metric_of_the_scaffold_keeps_every_rule(tmp_path, monkeypatch):
     assert "right 1, 400 m off 0, no answer 0" in [row.found for row in found]
     values = {field.name for field in dataclasses.fields(sgb.MeanMetric)}
     assert {"name", "meaning", "unit", "better", "bounds", "tracks", "values"} <= values
+
+
+def test_the_metric_of_the_guide_keeps_every_rule(named, tmp_path):
+    text = (Path(__file__).parents[2] / "docs" / "howto" / "metric.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    made: dict[str, object] = {}
+    exec(code, made)  # noqa: S102 - of our own documents
+    assert {row.outcome for row in check_metric(named(made["METRIC"]), out=tmp_path)} == {"pass"}
 
 
 @pytest.mark.parametrize("name", ["success_25m", "rank", "My_Metric", "numpy"])

@@ -78,7 +78,7 @@ _DOORS: Final = {
     "metric": _Door(
         METRICS,
         "scoring.metric_plugins:find_metric",
-        "scoring.metric_plugins:metric_files",
+        "scoring.metric_testing:metric_files",
         "scoring.metric_testing:check_metric",
     ),
     "perturbation": _Door(

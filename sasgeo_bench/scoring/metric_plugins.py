@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics of other packages: found by name or module:NAME, measured on scored rows, and begun in a new package."""
+"""Metrics of other packages: found by name or module:NAME, and measured on scored rows."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,10 +11,9 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, MatchError, MetricError
+from sasgeo_bench.errors import MatchError, MetricError
 from sasgeo_bench.files.plugins import METRICS as GROUP
 from sasgeo_bench.files.plugins import check_own_name, code_of, find_inside, list_entry_points, plugin_code
-from sasgeo_bench.matching.scaffold import package_files
 from sasgeo_bench.progress import tell
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.metric import MeanMetric, Metric
@@ -24,7 +23,7 @@ from sasgeo_bench.scoring.score import NOT_APPLICABLE
 from sasgeo_bench.texts import message_of
 
 SHIPPED: Final[Mapping[str, Metric]] = {metric.name: metric for metric in METRICS}
-_COLUMNS: Final = frozenset({*LEADERBOARD_SCHEMA.names, "rank", "control"})  # of boards and their tables
+COLUMNS: Final = frozenset({*LEADERBOARD_SCHEMA.names, "rank", "control"})  # of boards and their tables
 _SLACK: Final = 1e-9  # of a value beside its bound
 
 
@@ -100,7 +99,7 @@ def _silence(metric: MeanMetric) -> str | None:
     tracks = metric.tracks if isinstance(metric.tracks, tuple | list) else ()
     are_tracks = bool(tracks) and all(track in TRACKS for track in tracks)
     faults = {
-        f"it is named {metric.name!r}, as a column of boards: rename it": metric.name in _COLUMNS,
+        f"it is named {metric.name!r}, as a column of boards: rename it": metric.name in COLUMNS,
         f"its {blank} is {getattr(metric, str(blank), '')!r}, expected a line of text": blank is not None,
         f"better is {metric.better!r}, expected 'higher' or 'lower'": metric.better not in ("higher", "lower"),
         f"bounds are {metric.bounds!r}, expected the least and the greatest value, as in (0.0, 1.0)": not are_bounds,
@@ -228,60 +227,3 @@ def unequal(columns: Mapping[str, Floats], scores: Mapping[str, pd.DataFrame]) -
                     "its truth, never on the answer, or a method could choose its queries"
                 )
     return None
-
-
-_METRIC: Final = '''\
-"""The metric {name}: here is where your measure goes."""
-
-import numpy as np
-import pandas as pd
-from sasgeo_bench import MeanMetric
-
-NEAR_M, FAR_M = 5.0, 50.0
-
-
-def values(scores: pd.DataFrame) -> np.ndarray:
-    """Return a number for each row of scores.parquet; NaN leaves a query out, whoever answered it."""
-    error_m = scores["position_error_m"].to_numpy(float)  # infinite without an answer, which so scores 0
-    near = np.clip((FAR_M - error_m) / (FAR_M - NEAR_M), 0.0, 1.0)
-    return np.where(scores["is_present"], near, np.nan)
-
-
-METRIC = MeanMetric(
-    name="{name}",
-    meaning="Nearness of the fix: 1 within 5 m of the place, 0 beyond 50 m or without an answer, even between",
-    unit="1",
-    better="higher",
-    bounds=(0.0, 1.0),
-    tracks=("localization",),
-    values=values,
-)
-'''
-
-_README: Final = """\
-# {title}
-
-A metric for sasgeo-bench: one more column of every table of suites.
-
-```bash
-pip install -e .
-sasgeo-bench check {name}
-sasgeo-bench score --predictions out/runs --metric {name} --name with-{name}
-```
-
-The metric is a mean over queries of what `values` in `src/{module}/metric.py` returns. A pipeline file takes it as
-`metrics = ["{name}"]`. It runs inside the program, without a sandbox; a board names it with the hash of its code.
-"""
-
-
-def metric_files(name: str) -> dict[str, str]:
-    """Return the text of every file of a new package with a metric, by its path.
-
-    `name` is that of the metric; raise `ConfigError` if it is not allowed, or taken.
-
-    >>> sorted(metric_files("my-metric"))[-1]
-    'tests/test_conforms.py'
-    """
-    if name in SHIPPED or name in _COLUMNS:
-        raise ConfigError(f"{name!r} is a metric or a column of sasgeo-bench itself; choose another name")
-    return package_files(name, group=GROUP, code=_METRIC, readme=_README, attribute="METRIC")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The conformance kit of metrics: what every mean over queries promises, checked on answers worked by hand."""
+"""Metrics of one's own: a new package, and what each promises, checked on answers worked by hand."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -13,15 +13,17 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import MatchError, MetricError
+from sasgeo_bench.errors import ConfigError, MatchError, MetricError
 from sasgeo_bench.files.folders import scratch_folder
+from sasgeo_bench.files.plugins import METRICS
 from sasgeo_bench.matching.matcher import Prediction
+from sasgeo_bench.matching.scaffold import package_files
 from sasgeo_bench.running.testing import Check, tiny_place, tried
 from sasgeo_bench.running.tracker_testing import tiny_flights
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.flights import score_flights
 from sasgeo_bench.scoring.metric import MeanMetric
-from sasgeo_bench.scoring.metric_plugins import find_metric, unequal, values_of
+from sasgeo_bench.scoring.metric_plugins import COLUMNS, SHIPPED, find_metric, unequal, values_of
 from sasgeo_bench.scoring.score import score_task
 from sasgeo_bench.tasks.query import SEQUENCE, Head, Truth
 from sasgeo_bench.tasks.task_files import Task
@@ -170,3 +172,60 @@ class _Kit:
             if (sign * silent > sign * values[name][present] + _SLACK).any():
                 return f"a place on the map without an answer is better than an answer that is {name}"
         return None
+
+
+_METRIC: Final = '''\
+"""The metric {name}: here is where your measure goes."""
+
+import numpy as np
+import pandas as pd
+from sasgeo_bench import MeanMetric
+
+NEAR_M, FAR_M = 5.0, 50.0
+
+
+def values(scores: pd.DataFrame) -> np.ndarray:
+    """Return a number for each row of scores.parquet; NaN leaves a query out, whoever answered it."""
+    error_m = scores["position_error_m"].to_numpy(float)  # infinite without an answer, which so scores 0
+    near = np.clip((FAR_M - error_m) / (FAR_M - NEAR_M), 0.0, 1.0)
+    return np.where(scores["is_present"], near, np.nan)
+
+
+METRIC = MeanMetric(
+    name="{name}",
+    meaning="Nearness of the fix: 1 within 5 m of the place, 0 beyond 50 m or without an answer, even between",
+    unit="1",
+    better="higher",
+    bounds=(0.0, 1.0),
+    tracks=("localization",),
+    values=values,
+)
+'''
+
+_README: Final = """\
+# {title}
+
+A metric for sasgeo-bench: one more column of every table of suites.
+
+```bash
+pip install -e .
+sasgeo-bench check {name}
+sasgeo-bench score --predictions out/runs --metric {name} --name with-{name}
+```
+
+The metric is a mean over queries of what `values` in `src/{module}/metric.py` returns. A pipeline file takes it as
+`metrics = ["{name}"]`. It runs inside the program, without a sandbox; a board names it with the hash of its code.
+"""
+
+
+def metric_files(name: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a metric, by its path.
+
+    `name` is that of the metric; raise `ConfigError` if it is not allowed, or taken.
+
+    >>> sorted(metric_files("my-metric"))[-1]
+    'tests/test_conforms.py'
+    """
+    if name in SHIPPED or name in COLUMNS:
+        raise ConfigError(f"{name!r} is a metric or a column of sasgeo-bench itself; choose another name")
+    return package_files(name, group=METRICS, code=_METRIC, readme=_README, attribute="METRIC")

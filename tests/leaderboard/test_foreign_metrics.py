@@ -18,7 +18,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.publishing.build import publish
-from sasgeo_bench.scoring.metric_plugins import metric_files
+from sasgeo_bench.scoring.metric_testing import metric_files
 from tests import world
 
 TOWN = "town-agricultural"

@@ -24,6 +24,7 @@ from sasgeo_bench.leaderboard.text import (
     Contents,
     control_lines,
     map_lines,
+    metric_lines,
     segmenter_lines,
     table_text,
     tables_of,
@@ -64,6 +65,10 @@ Rejectors = Annotated[
         help="name from list rejectors, or module:Class; may be repeated; default: none, or those of stored results"
     ),
 ]
+Metrics = Annotated[
+    list[str] | None,
+    typer.Option(help="one more than every board has: a name from list metrics, or module:NAME; may be repeated"),
+]
 Submissions = Annotated[
     list[Path] | None,
     typer.Option(help="a submission, or a folder of them, for stored results; those for their board are scored"),
@@ -97,6 +102,7 @@ class ScoreOptions(Options):
         ),
     ] = None
     rejector: Rejectors = None
+    metric: Metrics = None
     submissions: Submissions = None
     private: Private = None
     region_files: RegionFolders = None
@@ -152,6 +158,7 @@ def score(options: ScoreOptions) -> Board:
     request = replace(
         usual,
         tasks=options.tasks or (),
+        metrics=options.metric or (),
         truth=options.truth,
         draws=options.draws or usual.draws,
         without=options.without or (),
@@ -305,5 +312,5 @@ def show_board(board: Board) -> None:
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
-    for line in (*map_lines(board.about), *warnings_of(board.leaderboard)):
+    for line in (*map_lines(board.about), *warnings_of(board.leaderboard), *metric_lines(board.about)):
         tell(line)

@@ -5,13 +5,13 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.manifests import BoardEntry, SeedFigure
+from sasgeo_bench.leaderboard.manifests import BoardEntry, MetricRecord, SeedFigure
 from sasgeo_bench.leaderboard.tables import (
     FEW,
     Cell,
@@ -81,9 +81,9 @@ MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1
 class Book:
     """Figures of a board that take every answer, by entry and queries; and the names of the pages that show them.
 
-    `controls` are the entries that are never ranked. `counted` names the kinds and steps of stress that the
-    first figure of a table counts, `lost` the entries without a sound answer, and how often; both are empty without
-    scored queries.
+    `controls` are the entries that are never ranked, `metrics` those of other packages by name. `counted` names the
+    kinds and steps of stress that the first figure of a table counts, `lost` the entries without a sound answer, and
+    how often; both are empty without scored queries.
     """
 
     figures: Mapping[tuple[str, ...], Record]
@@ -95,10 +95,18 @@ class Book:
     suite_pages: Mapping[str, str]
     counted: Mapping[Key, str]
     lost: Mapping[Key, str]
+    metrics: Mapping[str, MetricRecord] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, board: pd.DataFrame, listed: Sequence[BoardEntry] = (), scores: pd.DataFrame | None = None) -> Self:
-        """Index a leaderboard with its entries, which may be listed, and its scored queries."""
+    def of(
+        cls,
+        board: pd.DataFrame,
+        listed: Sequence[BoardEntry] = (),
+        scores: pd.DataFrame | None = None,
+        *,
+        metrics: Sequence[MetricRecord] = (),
+    ) -> Self:
+        """Index a leaderboard with its entries, which may be listed, its scored queries and metrics of others."""
         entries = {entry.name: entry for entry in listed}
         for row in records_of(board.drop_duplicates("matcher")) if "set_apart" in board else ():
             reason: str | None = None if pd.isna(row["set_apart"]) else row["set_apart"]
@@ -126,6 +134,7 @@ class Book:
             suite_pages=page_names("suite", [suite for suite, _, _ in sorted(matchers)]),
             counted={key: _counted(rows) for key, rows in _by_group(scored)},
             lost={key: ", ".join(_lost(rows)) for key, rows in _by_group(scored)},
+            metrics={one.name: one for one in metrics},
         )
 
     def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
@@ -135,6 +144,19 @@ class Book:
     def main(self, key: Key, matcher: str, metric: str) -> Record | None:
         """Return the figure under stress, or of all queries where nothing is stressed."""
         return self.pick(key, matcher, metric, STRESS) or self.pick(key, matcher, metric)
+
+    def besides(self, track: str) -> tuple[str, ...]:
+        """Return the figures that a table shows beside the primary one, of the same queries."""
+        own = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
+        return (*own, *(name for name, one in self.metrics.items() if track in one.tracks))
+
+    def column(self, term: str, *, order: str = "none") -> Column:
+        """Return the column of a term, which may be a metric of another package."""
+        metric, plain = self.metrics.get(term), column(term, order=order)
+        if metric is None:
+            return plain
+        unit = "" if metric.unit == "1" else f" ({metric.unit})"
+        return replace(plain, name=f"{term}{unit}", meaning=metric.to_text())
 
     def name_cell(self, matcher: str) -> Cell:
         """Return the name of a matcher with its marks and a link to its page."""
@@ -259,7 +281,7 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     tone = {name: "tied" if number % 2 == 0 else "other-tie" for name, number in tie_of.items()}
     tone |= dict.fromkeys(book.controls, "control")
     shares = Mark(text="tie", meaning="shares ranks with others, named below the table")
-    beside = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)  # of the same queries as the first figure
+    beside = book.besides(track)
 
     def _figure(metric: str, stratum: str = "") -> Callable[[Record], Cell]:
         return lambda row: figure_cell(book.pick(key, row["matcher"], metric, stratum or row["stratum"]))
@@ -268,7 +290,7 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
         (word("matcher"), lambda row: book.name_cell(row["matcher"])),
         (column(primary, order="descending"), lambda row: figure_cell(row, has_bar=True)),
         (column("rank"), lambda row: rank_cell(row, ranked=ranked, mark=shares if row["matcher"] in tie_of else None)),
-        *((column(metric), _figure(metric)) for metric in beside),
+        *((book.column(metric), _figure(metric)) for metric in beside),
         (column("control"), _figure(primary, CONTROL)),
         (column("false fixes"), _figure(FALSE_ABSENT.name, ALL)),
         (column("detectable"), lambda row: float(row["detectable"])),

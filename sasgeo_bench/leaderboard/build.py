@@ -89,6 +89,7 @@ def board_texts(scored: Scored) -> Extra:
     of = Contents(
         leaderboard=board.leaderboard,
         entries=board.about.entries,
+        metrics=board.about.metrics,
         findings=board.findings,
         falsifiers=scored.falsifiers,
         verdicts=board.verdicts,

@@ -203,6 +203,32 @@ class RejectorRecord(Record):
     is_calibrated: bool | None = None
 
 
+class MetricRecord(Record):
+    """A metric of another package: what tables show of it, and its `code`, as module:NAME, with its SHA-256.
+
+    A bound that is missing is infinite.
+    """
+
+    name: str
+    code: str
+    sha256: Sha256
+    meaning: str
+    source: str
+    unit: str
+    better: Literal["higher", "lower"]
+    least: float | None = None
+    greatest: float | None = None
+    tracks: list[str]
+
+    def to_text(self) -> str:
+        """Return in a line what it says, of what, and whose it is."""
+        least, greatest = ("any" if end is None else f"{end:g}" for end in (self.least, self.greatest))
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        whose = f"a metric of {self.code} ({self.sha256[:12]}), not of sasgeo-bench"
+        said = f"{self.meaning.removesuffix('.')}. {self.better.capitalize()} is better, {least} to {greatest}{unit}"
+        return f"{said}; {whose}"
+
+
 class BoardManifest(Record):
     """All of `board.json`; every board has the fields without a default.
 
@@ -210,7 +236,9 @@ class BoardManifest(Record):
     []
     """
 
-    without_empty: ClassVar = frozenset({"title", "private_seed", "private", "sealed", "elsewhere", "failed"})
+    without_empty: ClassVar = frozenset(
+        {"title", "private_seed", "private", "sealed", "metrics", "elsewhere", "failed"}
+    )
 
     scorer_version: int
     entries: list[BoardEntry]
@@ -231,6 +259,7 @@ class BoardManifest(Record):
     by_block: list[str] = []
     without: list[str] = []
     rejectors: list[RejectorRecord] = []
+    metrics: list[MetricRecord] = []
     remarks: list[str] = []
     elsewhere: list[Elsewhere] = []
     failed: dict[str, str] = {}

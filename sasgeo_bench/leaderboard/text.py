@@ -31,7 +31,7 @@ from sasgeo_bench.leaderboard.board_tables import (
     suite_tables,
     summary,
 )
-from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardManifest
+from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardManifest, MetricRecord
 from sasgeo_bench.leaderboard.tables import DAGGER, NOTE, RANKS_NOTE, TERMS, Table, text_of
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
 from sasgeo_bench.scoring.compare import Finding
@@ -228,6 +228,11 @@ def segmenter_lines(about: BoardManifest) -> list[str]:
     ]
 
 
+def metric_lines(about: BoardManifest) -> list[str]:
+    """Return which metrics are of other packages, and whose code they are."""
+    return [f"{one.name}: {one.to_text()}." for one in about.metrics]
+
+
 # --- the tables -------------------------------------------------------------------------------------------------------
 
 
@@ -236,7 +241,8 @@ class Contents:
     """What the tables of a board are made of; of what is empty there is no table.
 
     `scores` are the scored queries, `steps` the steps of stress (`strata.steps_frame`), `ages` their names where they
-    are ages of a map (`plots.age_names`), `scenes` success by kind of place (`tables.scene_frame`).
+    are ages of a map (`plots.age_names`), `scenes` success by kind of place (`tables.scene_frame`), `metrics`
+    those of other packages.
     """
 
     leaderboard: pd.DataFrame
@@ -250,11 +256,12 @@ class Contents:
     steps: pd.DataFrame = field(default_factory=pd.DataFrame)
     ages: Mapping[tuple[Any, ...], str] = field(default_factory=dict)
     scenes: pd.DataFrame = field(default_factory=pd.DataFrame)
+    metrics: Sequence[MetricRecord] = ()
 
     @cached_property
     def book(self) -> Book:
         """Return the figures that take every answer, by entry and queries."""
-        return Book.of(self.leaderboard, self.entries, self.scores)
+        return Book.of(self.leaderboard, self.entries, self.scores, metrics=self.metrics)
 
 
 class TableKind(NamedTuple):
@@ -309,6 +316,7 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
         *warnings_of(of.leaderboard),
         *training_lines(about),
         *segmenter_lines(about),
+        *metric_lines(about),
         *(f"Failed, and not on this board: {name}: {why}" for name, why in about.failed.items()),
     ]
     columns = {column.term: column.meaning for table in tables for column in table.columns}

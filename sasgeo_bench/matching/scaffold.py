@@ -10,11 +10,21 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugins import CARD_FILE, KINDS, MATCHERS, SEGMENTERS, SUITES, TRACKERS, shipped_names
+from sasgeo_bench.files.plugins import (
+    CARD_FILE,
+    KINDS,
+    MATCHERS,
+    NAME,
+    PERTURBATIONS,
+    SEGMENTERS,
+    SUITES,
+    TRACKERS,
+    shipped_names,
+)
 from sasgeo_bench.matching.submission import EXAMPLE
+from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
-_NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
 _LONGEST: Final = 60
 # Modules that a package of this name would hide: of Python, of this package and its imports, and of common tools.
 _TAKEN: Final = frozenset(
@@ -151,12 +161,20 @@ def plugin_files(name: str) -> dict[str, str]:
 
 
 def package_files(
-    name: str, *, group: str, code: str, readme: str, card: str | None = None, attribute: str | None = None
+    name: str,
+    *,
+    group: str,
+    code: str,
+    readme: str,
+    card: str | None = None,
+    attribute: str | None = None,
+    others: Mapping[str, str] | None = None,
 ) -> dict[str, str]:
     """Return the text of every file of a new package with a plugin, by its path.
 
     `group` is that of its entry point; `code`, `readme` and `card`, where it has one, are templates. `attribute` is
-    what the entry point names, if that is not the class. Raise `ConfigError` if the name is not allowed, or taken.
+    what the entry point names, if that is not the class. `others` are more files, or others in
+    their place, templates too. Raise `ConfigError` if the name is not allowed, or taken.
     """
     # Words of the import lines of a module, which its own class must not be called
     imported_names = frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", code, re.MULTILINE))))
@@ -169,6 +187,7 @@ def package_files(
         "src/{module}/{kind}.py": code,
         "tests/test_conforms.py": _TEST,
     } | ({} if card is None else {f"src/{{module}}/{CARD_FILE}": card})
+    files |= others or {}
     return {path.format(**words): text.format(**words) for path, text in files.items()}
 
 
@@ -177,9 +196,9 @@ def _words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, 
     # The class is called as none of the `imported` names is. Raise `ConfigError` if the name is not allowed, or taken.
     kind = KINDS[group]
     module = name.replace("-", "_")
-    if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
+    if NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
         raise ConfigError(f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name")
-    if not _NAME.fullmatch(name):
+    if not NAME.fullmatch(name):
         raise ConfigError(
             f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, a letter first, as in "
             f"my-{kind}; got {name!r}"
@@ -334,6 +353,8 @@ class {cls}:
         rows, cols = evidence.shape
         hidden = rng.permutation(rows) < round(self.share * rows)
         return hide(evidence, np.broadcast_to(hidden[:, None], (rows, cols)))
+'''
+_CHANGE: Final = '''\
 
 
 def change(variant: Variant, evidence: Evidence, rng: np.random.Generator) -> Evidence:
@@ -389,7 +410,96 @@ def suite_files(name: str) -> dict[str, str]:
         raise ConfigError(
             f"{name!r} is a suite of sasgeo-bench itself, which would be used instead of yours; choose another"
         )
-    return package_files(name, group=SUITES, code=_SUITE, readme=_SUITE_README, attribute="SUITE")
+    return package_files(name, group=SUITES, code=_SUITE + _CHANGE, readme=_SUITE_README, attribute="SUITE")
+
+
+_PERTURBATION: Final = '''\
+"""The perturbation {name}: here is where your stress goes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from sasgeo_bench import Evidence, check_ranges, hide
+
+
+@dataclass(frozen=True)
+class {cls}:
+    """Hides whole rows of the view. At strength 0 it changes no cell, and all chance comes from `rng`."""
+
+    share: float
+
+    def __post_init__(self) -> None:
+        """Refuse a share out of range."""
+        check_ranges(self, share=(0.0, 1.0))
+
+    def __call__(self, evidence: Evidence, rng: np.random.Generator) -> Evidence:
+        """Return the view with some rows unknown."""
+        rows, cols = evidence.shape
+        hidden = rng.permutation(rows) < round(self.share * rows)
+        return hide(evidence, np.broadcast_to(hidden[:, None], (rows, cols)))
+'''
+
+_STRESS: Final = '''\
+"""The suite {name}: the perturbation {cls} at a ladder of strengths."""
+
+import numpy as np
+from sasgeo_bench import VIEW_CELLS, Evidence, PlainSuite, SuiteCard, Variant, controls, ladder
+
+from {module}.perturbation import {cls}
+'''
+
+_STRESS_TEST: Final = '''\
+"""The suite keeps to what every suite keeps to."""
+
+from sasgeo_bench import check_suite
+
+
+def test_it_conforms():
+    faults = [check for check in check_suite("{module}.suite:SUITE") if check.outcome == "fail"]
+    assert not faults, faults
+'''
+
+_SUITE_POINT: Final = """
+[project.entry-points."sasgeo_bench.suites"]
+{name} = "{module}.suite:SUITE"
+"""
+
+_PERTURBATION_README: Final = """\
+# {title}
+
+A perturbation for sasgeo-bench, and a suite that draws queries under it.
+
+```bash
+pip install -e .
+sasgeo-bench check {name}
+sasgeo-bench make-queries --suite {name} --regions town-riverside --n 2
+sasgeo-bench inspect {name}/town-riverside --rows 6
+```
+
+The stress is in `src/{module}/perturbation.py`; say in the card of the suite (`src/{module}/suite.py`) what should
+differ before you run anything.
+"""
+
+
+def perturbation_files(name: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a perturbation and a suite that uses it, by its path.
+
+    `name` is that of both; raise `ConfigError` if it is not allowed, or taken.
+
+    >>> [path for path in sorted(perturbation_files("my-stress")) if path.startswith("tests")]
+    ['tests/test_conforms.py', 'tests/test_suite.py']
+    """
+    taken = next((kind for kind, names in (("perturbation", SHIPPED), ("suite", EVERY_SUITE)) if name in names), None)
+    if taken:
+        raise ConfigError(
+            f"{name!r} is a {taken} of sasgeo-bench itself, which would be used instead of yours; choose another"
+        )
+    others = {
+        "pyproject.toml": _PYPROJECT.replace("\n[tool.", f"{_SUITE_POINT}\n[tool."),
+        "src/{module}/suite.py": _STRESS + _CHANGE,
+        "tests/test_suite.py": _STRESS_TEST,
+    }
+    return package_files(name, group=PERTURBATIONS, code=_PERTURBATION, readme=_PERTURBATION_README, others=others)
 
 
 _TRACKER: Final = '''\

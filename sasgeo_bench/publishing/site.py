@@ -100,6 +100,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         acceptance=board.acceptance,
         protection=board.protection,
         scenes=source.scenes,
+        metrics=board.about.metrics,
     )
     site = Site(
         source=source,
@@ -221,7 +222,10 @@ def _rejection(site: Site) -> dict[str, object]:
 
 def _method(site: Site) -> dict[str, object]:
     about = site.source.board.about
-    return {"learned": [*training_lines(about), *segmenter_lines(about)], "meanings": MEANINGS | MARKS}
+    return {
+        "learned": [*training_lines(about), *segmenter_lines(about)],
+        "meanings": MEANINGS | {one.name: one.to_text() for one in about.metrics} | MARKS,
+    }
 
 
 PAGES: Final = (  # in the order of the navigation

@@ -43,10 +43,6 @@ def _column(scores: pd.DataFrame, name: str) -> Floats:
     return scores[name].to_numpy(float)
 
 
-def _every(scores: pd.DataFrame) -> Bools:
-    return np.ones(len(scores), dtype=bool)
-
-
 def _is_longer(scores: pd.DataFrame, than_m: float) -> Bools:
     return (scores["length_m"] > than_m).to_numpy(bool)
 
@@ -64,7 +60,7 @@ def _off_inside(scores: pd.DataFrame) -> Floats:
 
 
 def _flight_mean(name: str, meaning: str, **more: Any) -> MeanMetric:  # noqa: ANN401 - other fields of the metric
-    fields: dict[str, Any] = {"source": "mean over flights", "values": partial(_column, name=name), "counts": _every}
+    fields: dict[str, Any] = {"source": "mean over flights", "values": partial(_column, name=name)}
     return MeanMetric(name=name, meaning=meaning, tracks=(SEQUENCE,), **(fields | more))
 
 

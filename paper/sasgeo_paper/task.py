@@ -211,6 +211,7 @@ def _origin(region: Region, crop: Crop, views_cells: list[int]) -> TaskOrigin:
         map_date=region.manifest.extract.date.isoformat(),
         map_fingerprint=region.manifest.fingerprint,
         map_inputs_sha256=region.manifest.inputs_sha256,
+        provenance=region.manifest.provenance,
         sites=TILES,
         views_cells=views_cells,
         epsg=region.manifest.epsg,

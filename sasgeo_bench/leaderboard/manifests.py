@@ -8,7 +8,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 
 from sasgeo_bench.config import Record
 from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Provenance
 from sasgeo_bench.running.prediction_files import CardRecord
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast
@@ -160,15 +160,16 @@ class BoardEntry(Record):
 class BoardTask(Record):
     """A task that a board asked."""
 
-    without_empty: ClassVar = frozenset({"failed_pictures"})
+    without_empty: ClassVar = frozenset({"failed_pictures", "provenance"})
 
-    region: str
     suite: str
     suite_version: int | None = None
+    region: str
     map_date: str | None = None
     queries_sha256: str | None = None
     map_fingerprint: str | None = None
     failed_pictures: int | None = None
+    provenance: Provenance = Provenance()  # of the map
 
 
 class ElsewhereRow(Record):

@@ -373,18 +373,7 @@ def _record_of(
         elsewhere=list(request.elsewhere),
         failed=dict(failed),
         entries=list(entries),
-        tasks=[
-            BoardTask(
-                suite=item.suite,
-                suite_version=item.suite_version,
-                region=item.region,
-                map_date=item.map_date,
-                queries_sha256=item.queries_sha256,
-                map_fingerprint=item.map_fingerprint,
-                failed_pictures=item.failed_pictures,
-            )
-            for item in tasks
-        ],
+        tasks=[BoardTask(**{name: getattr(item, name) for name in BoardTask.model_fields}) for item in tasks],
     )
 
 

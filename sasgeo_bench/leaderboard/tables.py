@@ -12,6 +12,7 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.board_files import SCHEMAS
 from sasgeo_bench.leaderboard.manifests import BoardEntry
+from sasgeo_bench.regions.region import Provenance
 from sasgeo_bench.scoring.compare import LEAST_PLACES, RankInterval
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE, is_unranked
@@ -390,7 +391,8 @@ _OF_CONTRASTS: Final = {  # metrics of registered contrasts alone
     "shift": "Share of queries that are right, less that on the views of the same sites by the detector `published`: "
     "what another detector adds to the difference",
 }
-MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS | _OF_CONTRASTS
+_OF_PLACES: Final = {str(line.title): str(line.description) for line in Provenance.model_fields.values()}
+MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS | _OF_CONTRASTS | _OF_PLACES
 NOTE: Final = (
     "Intervals are 95 %: a bootstrap over places, then blocks, then sites ({draws} draws), never narrower than over "
     f"blocks alone, nor than Wilson's with as many trials as there are sites; {DAGGER} marks those where Wilson's is "

@@ -470,11 +470,13 @@ def region_table(source: SiteSource) -> Table:
     """Return a table of every region of the board, its position and what was drawn there."""
     numbers = {item.name: item.number for item in places_on_map(source.board.about.tasks, source.spots, source.parts)}
     rows = []
+    lines = dict.fromkeys(title for task in source.board.about.tasks for title in task.provenance.titled())
     for region, tasks in regions_of(source.board.about.tasks).items():
         place, part = source.parts.get(region, (region, "-"))
         spot = source.spots.get(region)
         dates = sorted({task.map_date for task in tasks if task.map_date})
         suites = sorted({task.suite for task in tasks})
+        stated = [task.provenance.titled() for task in tasks]
         rows.append(
             Row(
                 cells=(
@@ -485,12 +487,16 @@ def region_table(source: SiteSource) -> Table:
                     Cell(text="-" if spot is None else ", ".join(spot.scenes)),
                     Cell(text=", ".join(dates) or "-"),
                     Cell(text=", ".join(suites)),
+                    *(
+                        Cell(text="; ".join(sorted({one[title] for one in stated if title in one})) or "-")
+                        for title in lines
+                    ),
                 )
             )
         )
     columns = [
         column(name, is_number=name == "no.", order="ascending" if name == "regions" else "none")
-        for name in ("regions", "no.", "place", "half or part", "scenes", "dates", "suites")
+        for name in ("regions", "no.", "place", "half or part", "scenes", "dates", "suites", *lines)
     ]
     return Table(name="regions", title="Regions of this board", columns=tuple(columns), rows=tuple(rows))
 

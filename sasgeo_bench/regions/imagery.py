@@ -5,11 +5,11 @@ import datetime as dt
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import ConfigDict, Field
 
 from sasgeo_bench.config import Document, Line
 from sasgeo_bench.errors import ImageryError, StoreError
@@ -54,6 +54,8 @@ class PictureRecord(_Record):
     A picture that was rendered has `rendered`: its file, hash and date are those of the extract that it shows.
     """
 
+    without_empty: ClassVar = frozenset({"rendered"})
+
     file: str
     sha256: str
     bytes: Annotated[int, Field(ge=0)]
@@ -64,12 +66,6 @@ class PictureRecord(_Record):
     source: str | None
     gsd_m: Metres
     rendered: RenderedRecord | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `rendered` where there is none, as regions of older versions do."""
-        fields: dict[str, Any] = write(self)
-        return fields if self.rendered else {name: value for name, value in fields.items() if name != "rendered"}
 
     def to_text(self) -> str:
         """Describe in a few words what it is."""
@@ -230,7 +226,7 @@ def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
     try:
         with open_geotiff(path) as whole:
             fitting = [factor for factor in whole.overviews(1) if factor * whole.res[0] <= grid.cell_size_m]
-        level: dict[str, Any] = {"overview_level": len(fitting) - 1} if fitting else {}
+        level = {"overview_level": len(fitting) - 1} if fitting else {}
         with (
             open_geotiff(path, **level) as source,
             WarpedVRT(

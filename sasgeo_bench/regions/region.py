@@ -4,14 +4,14 @@
 import datetime as dt
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Self, TypeVar, cast
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import ConfigDict, Field
 
-from sasgeo_bench.config import Document
+from sasgeo_bench.config import Document, Line, Record
 from sasgeo_bench.files.folders import FileRecord
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
@@ -40,8 +40,30 @@ class _Record(Document):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
 
+class Provenance(Record):
+    """Lines on the origin of a place, as `[provenance]` of its region file states them.
+
+    Each goes whole to `region.json`, `task.json`, `board.json`, archives and releases, and is a column of a board's
+    table of maps, as soon as it is a field here: text, a number, or None where the file states nothing.
+
+    >>> Provenance(surveyed_by="the village school").titled()
+    {'surveyed by': 'the village school'}
+    """
+
+    surveyed_by: Annotated[
+        Line | None, Field(title="surveyed by", description="Who surveyed the place, as its region file says")
+    ] = None
+
+    def titled(self) -> dict[str, str]:
+        """Return what is stated, by the titles of the lines."""
+        stated = {line.title or name: getattr(self, name) for name, line in Provenance.model_fields.items()}
+        return {title: str(value) for title, value in stated.items() if value is not None}
+
+
 class ExtractRecord(_Record):
     """The extract a region was built from; `also` are its further files with their SHA-256."""
+
+    without_empty: ClassVar = frozenset({"also"})
 
     file: str
     sha256: str
@@ -49,12 +71,6 @@ class ExtractRecord(_Record):
     date: dt.date
     osm_timestamp: dt.datetime | None
     also: dict[str, str] = {}
-
-    @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `also` where there is none, as regions of older versions do."""
-        fields: dict[str, Any] = write(self)
-        return fields if self.also else {name: value for name, value in fields.items() if name != "also"}
 
 
 class CoverageRecord(_Record):
@@ -86,6 +102,8 @@ class Manifest(_Record):
     another class is unknown everywhere. `imagery` is None in a region without.
     """
 
+    without_empty: ClassVar = frozenset({"imagery", "provenance"})
+
     schema_version: int
     data_version: int
     package_version: str
@@ -113,12 +131,7 @@ class Manifest(_Record):
     licence: str
     attribution: str
     imagery: OrthoRecord | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `imagery` where there is none, as regions of older versions do."""
-        fields: dict[str, Any] = write(self)
-        return fields if self.imagery else {name: value for name, value in fields.items() if name != "imagery"}
+    provenance: Provenance = Provenance()
 
     @property
     def grid(self) -> Grid:
@@ -228,6 +241,7 @@ class Region:
             "objects": ", ".join(f"{name} {count:,}" for name, count in about.counts.items() if count),
             "imagery": "none" if about.imagery is None else about.imagery.attribution,
             "data": about.attribution,
+            **about.provenance.titled(),
         }
         return html_facts(f"{about.title} ({about.id})", facts)
 

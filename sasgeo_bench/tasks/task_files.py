@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, chain, islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -26,7 +26,7 @@ from sasgeo_bench.files.parquet import open_table, read_schema, read_table, tabl
 from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, Evidence, pack, unpack
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest, Provenance
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.tasks.frames import FRAME, LABEL_SCHEMA, LABELS, frame_of, frame_row, label_row
 from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, TASK_VERSIONS, Head, Query, Step, Truth
@@ -437,6 +437,8 @@ class TaskOrigin(Document):
     Keys that a file lacks stay unset, so that a copy of the task lacks them, too.
     """
 
+    without_empty: ClassVar = frozenset({"provenance"})
+
     suite: Folder
     suite_version: Count | None = None
     suite_sha256: str | None = None  # of the code of a suite of another package
@@ -461,6 +463,7 @@ class TaskOrigin(Document):
     attribution: str | None = None
     segmenter: dict[str, str] | None = None  # what made the evidence of the pictures: name, version, hash
     failed_pictures: Count | None = None  # that the segmenter failed at
+    provenance: Provenance = Provenance()  # of the map
 
     @property
     def name(self) -> tuple[str, str]:

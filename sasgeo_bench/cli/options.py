@@ -87,7 +87,7 @@ class Options:
             object.__setattr__(self, name, _read(getattr(self, name), name, kind))
 
 
-def flags_of(options: type) -> dict[str, Any]:
+def flags_of(options: type) -> dict[str, object]:
     """Names and annotations of the flags of an options object, in their order."""
     hints = get_type_hints(options, include_extras=True)
     return {item.name: hints[item.name] for item in fields(options) if get_origin(hints[item.name]) is Annotated}

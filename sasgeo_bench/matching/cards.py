@@ -110,6 +110,15 @@ class TrainingRecord(Record):
     pairs: int
 
 
+class Learned(Record):
+    """A training by the runner: the file that was learned, if any, and the tasks that were asked under it."""
+
+    file: str | None
+    trained_on: list[str]
+    pairs: int
+    asked: list[str]
+
+
 def learned_path(run: Path, training_sha256: str) -> Path:
     """Return the file of the text that a matcher learned from a training set, below out/runs/<matcher>/<hash>."""
     return run / FOLDER / f"{training_sha256}.json"

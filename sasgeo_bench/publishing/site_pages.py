@@ -18,7 +18,7 @@ from sasgeo_bench.canvas import GREY, page
 from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, rejection_of, strata_tables, suite_table
 from sasgeo_bench.leaderboard.cases import FAILURES, MEANINGS
-from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardTask, Learned, Picture, RegionMap
+from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardTask, Picture, RegionMap
 from sasgeo_bench.leaderboard.plots import FAINT, BoardPage, line_keys, look_of
 from sasgeo_bench.leaderboard.tables import (
     Cell,
@@ -35,6 +35,7 @@ from sasgeo_bench.leaderboard.tables import (
     rank_cell,
     suite_card,
 )
+from sasgeo_bench.matching.cards import Learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.publishing.site_source import SiteFigure, SiteSource, Spot
 from sasgeo_bench.running.prediction_files import CardRecord

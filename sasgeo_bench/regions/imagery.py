@@ -226,9 +226,9 @@ def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
     try:
         with open_geotiff(path) as whole:
             fitting = [factor for factor in whole.overviews(1) if factor * whole.res[0] <= grid.cell_size_m]
-        level = {"overview_level": len(fitting) - 1} if fitting else {}
+        level = len(fitting) - 1 if fitting else None
         with (
-            open_geotiff(path, **level) as source,
+            open_geotiff(path, overview_level=level) as source,
             WarpedVRT(
                 source,
                 crs=source.crs,

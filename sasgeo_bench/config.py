@@ -70,6 +70,12 @@ class Document(BaseModel):
         return {name: value for name, value in handler(self).items() if value or name not in self.without_empty}
 
 
+class JsonDocument(Document):
+    """Base of strict JSON records: JSON has no tuples and no dates, so ordinary conversion is allowed."""
+
+    model_config = ConfigDict(strict=False)
+
+
 class Record(BaseModel):
     """Base of the models of what a program writes as JSON: frozen, no silent conversion.
 

@@ -66,7 +66,10 @@ STAGES: Final = {
     "leaderboard": "Boards and queries in a notebook",
 }
 _MODELS: Final[dict[str, tuple[str, Mapping[str, type[BaseModel]]]]] = {
-    "Region file": ("`regions/*.toml`", {"": RegionFile, "[[extract]]": Extract, "town": TownEntry, "[provenance]": Provenance}),
+    "Region file": (
+        "`regions/*.toml`",
+        {"": RegionFile, "[[extract]]": Extract, "town": TownEntry, "[provenance]": Provenance},
+    ),
     "Split file": ("`splits/*.toml`", {"": SplitFile, "[[place]]": Place}),
     "Pipeline file": (
         "`pipelines/*.toml`",

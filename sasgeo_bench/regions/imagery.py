@@ -9,9 +9,9 @@ from typing import Annotated, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from sasgeo_bench.config import Document, Line
+from sasgeo_bench.config import Document, JsonDocument, Line
 from sasgeo_bench.errors import ImageryError, StoreError
 from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.geotiff import open_geotiff
@@ -27,13 +27,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Metres = Annotated[float, Field(ge=0)]
 
 
-class _Record(Document):
-    """Base of JSON records: JSON has no tuples and no dates, so ordinary conversion is allowed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
-
-
-class RenderedRecord(_Record):
+class RenderedRecord(JsonDocument):
     """How a picture was rendered of a map: no photograph is in it.
 
     `map_sha256` is the hash of the inputs of the dated map that it shows, `made_by` the program.
@@ -48,7 +42,7 @@ class RenderedRecord(_Record):
     made_by: str
 
 
-class PictureRecord(_Record):
+class PictureRecord(JsonDocument):
     """One picture that the imagery was made of; `gsd_m` is its own ground resolution.
 
     A picture that was rendered has `rendered`: its file, hash and date are those of the extract that it shows.
@@ -75,7 +69,7 @@ class PictureRecord(_Record):
         return f"rendered from {self.file} of {self.date} ({look})"
 
 
-class OffsetRecord(_Record):
+class OffsetRecord(JsonDocument):
     """Measured offset of the imagery against the map: where a thing of the map is seen, less where the map has it.
 
     `east_m` and `north_m` with their 95 % intervals are of all tiles together; `residual_m` is the median distance of
@@ -99,7 +93,7 @@ class OffsetRecord(_Record):
         )
 
 
-class OrthoRecord(_Record):
+class OrthoRecord(JsonDocument):
     """The imagery of a region as `region.json` holds it: its pictures, lattice and offset against the map.
 
     `bounds_m` are west, south, east, north; `share` is the fraction of the mapped ground that it shows.

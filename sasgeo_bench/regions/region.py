@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Self
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from sasgeo_bench.config import Document, Line, Record
+from sasgeo_bench.config import JsonDocument, Line, Record
 from sasgeo_bench.files.folders import FileRecord
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
@@ -34,12 +34,6 @@ Count = Annotated[int, Field(ge=0)]
 Value = TypeVar("Value")
 
 
-class _Record(Document):
-    """Base of JSON records: JSON has no tuples and no dates, so ordinary conversion is allowed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
-
-
 class Provenance(Record):
     """Lines on the origin of a place, as `[provenance]` of its region file states them.
 
@@ -60,7 +54,7 @@ class Provenance(Record):
         return {title: str(value) for title, value in stated.items() if value is not None}
 
 
-class ExtractRecord(_Record):
+class ExtractRecord(JsonDocument):
     """The extract a region was built from; `also` are its further files with their SHA-256."""
 
     without_empty: ClassVar = frozenset({"also"})
@@ -73,7 +67,7 @@ class ExtractRecord(_Record):
     also: dict[str, str] = {}
 
 
-class CoverageRecord(_Record):
+class CoverageRecord(JsonDocument):
     """The mapped area: its source, its share of the grid, and its outline as WKT in the region's CRS.
 
     `unknown_m2` is the ground removed from it, by reason (one place may have two); `cuts` counts what an extract lost
@@ -94,7 +88,7 @@ class CoverageRecord(_Record):
         return "; ".join((f"{self.share:.1%} of the grid ({self.source}){about}", *reasons))
 
 
-class Manifest(_Record):
+class Manifest(JsonDocument):
     """`region.json`: identity and provenance of a region, and the hashes of its files.
 
     `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects in and around the grid by

@@ -20,7 +20,7 @@ from pydantic import ConfigDict, Field, JsonValue
 
 from sasgeo_bench.config import Document, check_document
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import file_record, sha256_of
+from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, read_schema, read_table, table_writer
 from sasgeo_bench.files.paths import given_path
@@ -412,17 +412,10 @@ _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # of a row group, which is in memory at once
 
 
-class TaskFile(Document):
-    """Hash and size of the queries."""
-
-    sha256: str
-    bytes: Count
-
-
 class TaskFiles(Document):
     """Files of a task, of which there is one."""
 
-    queries: Annotated[TaskFile, Field(alias=QUERIES)]
+    queries: Annotated[FileRecord, Field(alias=QUERIES)]
 
 
 class TaskOrigin(Document):

@@ -9,7 +9,7 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.tables import MEANINGS
+from sasgeo_bench.leaderboard.tables import column
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.publishing.archive_file import unpack_tasks
@@ -43,7 +43,7 @@ def read(path):
 @pytest.mark.parametrize("name", LINES)
 def test_every_line_may_be_missing_and_says_its_title_and_its_meaning(name):
     assert LINES[name].default is None
-    assert MEANINGS[LINES[name].title] == LINES[name].description
+    assert column(LINES[name].title).meaning == LINES[name].description
 
 
 def test_every_line_reaches_every_file_and_every_table(tmp_path, lay_towns, few_figures, plain_site):  # noqa: ARG001
@@ -61,11 +61,14 @@ def test_every_line_reaches_every_file_and_every_table(tmp_path, lay_towns, few_
     for folder in (request.board, tmp_path / "results"):
         assert [one.provenance.model_dump() for one in Board.open(folder).about.tasks] == [STATED]
     publish(request.board)
-    page = (request.board / "site" / "regions.html").read_text(encoding="utf-8")
+    page, method = (
+        (request.board / "site" / f"{name}.html").read_text(encoding="utf-8") for name in ("regions", "method")
+    )
     record = map_record(ReleaseMap(folder=region, manifest=read_manifest(region)))
     for title, text in Provenance(**STATED).titled().items():
         assert title in page
         assert text in page
+        assert title in method
     assert STATED.items() <= record.items()
 
 

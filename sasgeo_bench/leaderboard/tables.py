@@ -392,7 +392,7 @@ _OF_CONTRASTS: Final = {  # metrics of registered contrasts alone
     "what another detector adds to the difference",
 }
 _OF_PLACES: Final = {str(line.title): str(line.description) for line in Provenance.model_fields.values()}
-MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS | _OF_CONTRASTS | _OF_PLACES
+MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS | _OF_CONTRASTS
 NOTE: Final = (
     "Intervals are 95 %: a bootstrap over places, then blocks, then sites ({draws} draws), never narrower than over "
     f"blocks alone, nor than Wilson's with as many trials as there are sites; {DAGGER} marks those where Wilson's is "
@@ -440,7 +440,7 @@ def column(term: str, *, is_number: bool = True, order: str = "none", title: str
     >>> column("n").meaning
     'Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones'
     """
-    meaning = MEANINGS.get(term, _UNKNOWN)
+    meaning = MEANINGS.get(term) or _OF_PLACES.get(term, _UNKNOWN)
     return Column(term=term, name=title or term, meaning=meaning, is_number=is_number, order=order)
 
 

@@ -255,7 +255,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     templates = environment()
     about = source.board.about
     book = Book.of(source.board.leaderboard, about.entries, source.board.scores, metrics=about.metrics)
-    maps = place_maps(source)
+    maps, regions = place_maps(source), region_table(source)
     scenes = tuple(scene_tables(source.scenes, book)) if len(source.scenes) else ()
     rejection = rejection_tables(source.board.leaderboard)
     protection = protection_tables(source.board.protection)
@@ -294,12 +294,15 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "figures.html": {"kinds": kinds},
         "map.html": {"places": list(maps), "outcomes": ANSWER_OUTCOMES, "classes": load_taxonomy().classes},
         "failures.html": _failures(source, {place.region for place in maps}),
-        "regions.html": {"table": region_table(source)},
+        "regions.html": {"table": regions},
         "ageing.html": {"table": rate_table(source.rates), "kinds": kinds},
         "method.html": {
             "controls": control_table(source.board.verdicts),
             "learned": [*training_lines(source.board.about), *segmenter_lines(source.board.about)],
-            "meanings": MEANINGS | {one.name: one.to_text() for one in about.metrics} | MARKS,
+            "meanings": MEANINGS
+            | {one.name: one.to_text() for one in about.metrics}
+            | {one.term: one.meaning for one in regions.columns}
+            | MARKS,
         },
     }
     pages = {name: _render(templates, name, name, common | special[name]) for name in there}

@@ -154,9 +154,9 @@ class BoardTask(Record):
 
     without_empty: ClassVar = frozenset({"failed_pictures", "provenance"})
 
+    region: str
     suite: str
     suite_version: int | None = None
-    region: str
     map_date: str | None = None
     queries_sha256: str | None = None
     map_fingerprint: str | None = None

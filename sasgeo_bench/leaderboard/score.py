@@ -72,6 +72,7 @@ from sasgeo_bench.tasks.task_files import Task, TaskManifest
 
 _M2_PER_KM2: Final = 1e6
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
+_OF_TASKS: Final = ("suite", "suite_version", *BoardTask.model_fields)  # in the order of `board.json`
 
 
 def score_board(request: ScoreRequest) -> Scored:
@@ -372,7 +373,7 @@ def _record_of(
         elsewhere=list(request.elsewhere),
         failed=dict(failed),
         entries=list(entries),
-        tasks=[BoardTask(**{name: getattr(item, name) for name in BoardTask.model_fields}) for item in tasks],
+        tasks=[BoardTask(**{name: getattr(item, name) for name in _OF_TASKS}) for item in tasks],
     )
 
 

@@ -54,8 +54,8 @@ class BuildPlan:
     """Inputs and outputs of a build.
 
     `source` is None for an embedded town, which is made during the build; `more` are further files of the extract.
-    A region whose provenance alone differs from its file's is not current, but needs no picture.
-    `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date.
+    `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date, or
+    would be but for its provenance, which `region.json` alone holds.
     `with_preview` adds a picture of the layers, which takes longer than all else of a small region.
     """
 

@@ -854,18 +854,12 @@ def _counts_text(counts: Mapping[Any, int]) -> str:
 
 def read_queries(folder: str | Path) -> Iterator[Query]:
     """Yield the queries of a task in the order of their ids, a row group in memory at a time."""
-    path = given_path(folder) / QUERIES
-    for batch in read_batches(path, QUERY_SCHEMA.names):
-        for row in batch.to_pylist():
-            yield _made(path, query_of, row)
+    yield from _parsed(given_path(folder) / QUERIES, QUERY_SCHEMA, query_of)
 
 
 def read_truths(folder: str | Path) -> Iterator[Truth]:
     """Yield the truths of a task in the order of the query ids."""
-    path = given_path(folder) / TRUTH
-    for batch in read_batches(path, TRUTH_SCHEMA.names):
-        for row in batch.to_pylist():
-            yield _made(path, truth_of, row)
+    yield from _parsed(given_path(folder) / TRUTH, TRUTH_SCHEMA, truth_of)
 
 
 def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
@@ -908,6 +902,12 @@ def _is_known(field: pa.Field) -> bool:
     schemas = (FILE_SCHEMA, TRUTH_SCHEMA, PLAIN_TRUTH_SCHEMA)
     types = [schema.field(field.name).type for schema in schemas if field.name in schema.names]
     return not types or any(is_like(field.type, kind) for kind in types)
+
+
+def _parsed(path: Path, schema: pa.Schema, parse: Callable[[dict[str, object]], Made]) -> Iterator[Made]:
+    for batch in read_batches(path, schema.names):
+        for row in batch.to_pylist():
+            yield _made(path, parse, row)
 
 
 def _made(path: Path, make: Callable[[Row], Made], row: Row) -> Made:

@@ -499,7 +499,7 @@ def plugin_code(spec: str, *groups: str, tools: Collection[str] = (), always: Co
     module, name = code_of(spec, *groups)
     own = _own_files(spec, module, name, import_paths(spec))
     rooms = sorted({*always, *_rooms(own.values(), tools)})
-    used = {f"{_OURS}:{_shown(path)}": path for room in rooms for path in _room_files(room)}
+    used = {f"{_OURS}:{path.relative_to(_PACKAGE).as_posix()}": path for room in rooms for path in _room_files(room)}
     return digest_of(own | used)
 
 
@@ -779,7 +779,3 @@ def _room_files(room: str) -> list[Path]:
     place: Any = _PACKAGE.joinpath(*room.split("."))
     files = place.rglob("*.py") if place.is_dir() else (place.with_suffix(end) for end in (_PYTHON, ".toml"))
     return sorted(path for path in files if path.is_file())
-
-
-def _shown(path: Path) -> str:
-    return path.relative_to(_PACKAGE).as_posix()

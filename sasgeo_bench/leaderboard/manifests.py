@@ -8,7 +8,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 
 from sasgeo_bench.config import Record
 from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.matching.cards import Learned
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Provenance
 from sasgeo_bench.running.prediction_files import CardRecord
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast
@@ -62,15 +63,6 @@ class PackManifest(Record):
     files: dict[str, Sha256] | None = None  # of the first version there are none
     licence: str = LICENCE
     attribution: str = ATTRIBUTION
-
-
-class Learned(Record):
-    """A training by the runner: the file that was learned, if any, and the tasks that were asked under it."""
-
-    file: str | None
-    trained_on: list[str]
-    pairs: int
-    asked: list[str]
 
 
 class SeedRecord(Record):
@@ -160,7 +152,7 @@ class BoardEntry(Record):
 class BoardTask(Record):
     """A task that a board asked."""
 
-    without_empty: ClassVar = frozenset({"failed_pictures"})
+    without_empty: ClassVar = frozenset({"failed_pictures", "provenance"})
 
     region: str
     suite: str
@@ -169,6 +161,7 @@ class BoardTask(Record):
     queries_sha256: str | None = None
     map_fingerprint: str | None = None
     failed_pictures: int | None = None
+    provenance: Provenance = Provenance()  # of the map
 
 
 class ElsewhereRow(Record):

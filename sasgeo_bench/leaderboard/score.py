@@ -21,7 +21,6 @@ from sasgeo_bench.leaderboard.manifests import (
     BoardEntry,
     BoardManifest,
     BoardTask,
-    Learned,
     MetricRecord,
     RejectorRecord,
     SeedRecord,
@@ -33,7 +32,7 @@ from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.failures import Failures, log_beside, stops_all
-from sasgeo_bench.running.prediction_files import CardRecord, StoredAnswers
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding, with_causes
 from sasgeo_bench.scoring.contrasts import hold_contrasts
@@ -73,6 +72,7 @@ from sasgeo_bench.tasks.task_files import Task, TaskManifest
 
 _M2_PER_KM2: Final = 1e6
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
+_OF_TASKS: Final = ("suite", "suite_version", *BoardTask.model_fields)  # in the order of `board.json`
 
 
 def score_board(request: ScoreRequest) -> Scored:
@@ -373,18 +373,7 @@ def _record_of(
         elsewhere=list(request.elsewhere),
         failed=dict(failed),
         entries=list(entries),
-        tasks=[
-            BoardTask(
-                suite=item.suite,
-                suite_version=item.suite_version,
-                region=item.region,
-                map_date=item.map_date,
-                queries_sha256=item.queries_sha256,
-                map_fingerprint=item.map_fingerprint,
-                failed_pictures=item.failed_pictures,
-            )
-            for item in tasks
-        ],
+        tasks=[BoardTask(**{name: getattr(item, name) for name in _OF_TASKS}) for item in tasks],
     )
 
 
@@ -404,11 +393,11 @@ def _entry_of(entry: Entry, set_apart: str | None, on_private: OnPrivate, contro
         version=entry.version,
         hash=entry.hash,
         how=on_private.how(entry),
-        card=None if entry.card is None else CardRecord.model_validate(entry.card),
+        card=entry.card,
         trained_on=entry.declared,
         set_apart=set_apart,
         isolation=joined(run.isolation or {} for run in entry.runs) if entry.runs else None,
-        learned=[Learned.model_validate(one) for one in entry.learned()],
+        learned=entry.learned(),
         private=on_private.rows.get(entry.name),
         failed_controls=[item.to_text() for item in failed_controls(controls, entry.name)],
     )

@@ -13,6 +13,7 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.board_files import SCHEMAS
 from sasgeo_bench.leaderboard.manifests import BoardEntry
+from sasgeo_bench.regions.region import Provenance
 from sasgeo_bench.scoring.compare import LEAST_PLACES, RankInterval
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE, is_unranked
@@ -438,6 +439,7 @@ _OF_CONTRASTS: Final = {  # metrics of registered contrasts alone
     "shift": "Share of queries that are right, less that on the views of the same sites by the detector `published`: "
     "what another detector adds to the difference",
 }
+_OF_PLACES: Final = {str(line.title): str(line.description) for line in Provenance.model_fields.values()}
 MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS | _OF_CONTRASTS
 NOTE: Final = (
     "Intervals are 95 %: a bootstrap over places, then blocks, then sites ({draws} draws), never narrower than over "
@@ -486,7 +488,7 @@ def column(term: str, *, is_number: bool = True, order: str = "none", title: str
     >>> column("n").meaning
     'Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones'
     """
-    meaning = MEANINGS.get(term, _UNKNOWN)
+    meaning = MEANINGS.get(term) or _OF_PLACES.get(term, _UNKNOWN)
     return Column(term=term, name=title or term, meaning=meaning, is_number=is_number, order=order)
 
 

@@ -188,7 +188,7 @@ def _sealed_state(item: SealedPlace) -> str:
 def training_lines(about: BoardManifest) -> list[str]:
     """Return which rows are set apart, and which entries were trained on which places.
 
-    >>> from sasgeo_bench.leaderboard.manifests import Learned
+    >>> from sasgeo_bench.matching.cards import Learned
     >>> one = Learned(file="learned/ab.json", trained_on=["monaco", "porto"], pairs=24, asked=["clean/vaduz"])
     >>> mine = BoardEntry(name="mine", learned=[one])
     >>> training_lines(BoardManifest(scorer_version=6, entries=[mine], tasks=[]))

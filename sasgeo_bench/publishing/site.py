@@ -222,9 +222,11 @@ def _rejection(site: Site) -> dict[str, object]:
 
 def _method(site: Site) -> dict[str, object]:
     about = site.source.board.about
+    of_others = {one.name: one.to_text() for one in about.metrics}
+    of_regions = {one.term: one.meaning for one in region_table(site.source).columns}
     return {
         "learned": [*training_lines(about), *segmenter_lines(about)],
-        "meanings": MEANINGS | {one.name: one.to_text() for one in about.metrics} | MARKS,
+        "meanings": MEANINGS | of_others | of_regions | MARKS,
     }
 
 

@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Final
@@ -100,6 +101,11 @@ def region_table(source: SiteSource) -> Table:
     def _scenes(region: str) -> str:
         return ", ".join(source.spots[region].scenes) if region in source.spots else "-"
 
+    def _stated(title: str, region: str) -> str:  # of the provenance of its maps
+        stated = [task.provenance.titled() for task in listed[region]]
+        return "; ".join(sorted({one[title] for one in stated if title in one})) or "-"
+
+    lines = dict.fromkeys(title for task in source.board.about.tasks for title in task.provenance.titled())
     fields: tuple[Field[str], ...] = (
         (word("regions", order="ascending"), _title),
         (column("no."), lambda region: plain_cell(numbers.get(_part(region)[0]))),
@@ -111,6 +117,7 @@ def region_table(source: SiteSource) -> Table:
             lambda region: ", ".join(sorted({one.map_date for one in listed[region] if one.map_date})) or "-",
         ),
         (word("suites"), lambda region: ", ".join(sorted({one.suite for one in listed[region]}))),
+        *((word(title), partial(_stated, title)) for title in lines),
     )
     return table_of("regions", "Regions of this board", listed, fields)
 

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted, named
 from sasgeo_bench.files.plugins import ORACLE, shipped_names
-from sasgeo_bench.matching.cards import TrainingRecord
+from sasgeo_bench.matching.cards import Learned, TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.progress import tell
 from sasgeo_bench.running.failures import Failures
-from sasgeo_bench.running.prediction_files import RUN, Answers, RunManifest, StoredAnswers, damaged
+from sasgeo_bench.running.prediction_files import RUN, Answers, CardRecord, RunManifest, StoredAnswers, damaged
 from sasgeo_bench.scoring.controls import Verdict, hold_controls, knows_too_much
 from sasgeo_bench.scoring.flights import score_flights
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, PACKED, RUN_HERE, is_unranked
@@ -52,11 +52,11 @@ class Entry:
     submission: Submission | None = None
 
     @property
-    def card(self) -> dict[str, Any] | None:
+    def card(self) -> CardRecord | None:
         """Return the card of the matcher or submission; None for a file of predictions."""
         if self.submission is not None:
-            return self.submission.card.model_dump(mode="json")
-        return self.runs[0].matcher.model_dump(mode="json", exclude_unset=True) if self.runs else None
+            return CardRecord.model_validate(self.submission.card.model_dump(mode="json"))
+        return self.runs[0].matcher if self.runs else None
 
     @property
     def declared(self) -> list[str] | None:
@@ -71,15 +71,19 @@ class Entry:
         """Return True if the halves of a split were answered after different training."""
         return bool(self.learned()) or (self.submission is not None and self.submission.card.is_by_half)
 
-    def learned(self) -> list[dict[str, Any]]:
+    def learned(self) -> list[Learned]:
         """Return each training by the runner once: its source, its training places and the tasks asked under it."""
-        found: dict[str, dict[str, Any]] = {}
+        found: dict[str, TrainingRecord] = {}
+        asked: dict[str, list[str]] = {}
         for run in self.runs:
             if run.learned is not None:
-                fields = run.learned.model_dump(include=set(TrainingRecord.model_fields))
-                one = found.setdefault(run.learned.key, fields | {"asked": []})
-                one["asked"].append(f"{run.suite}/{run.region}")
-        return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
+                found.setdefault(run.learned.key, run.learned)
+                asked.setdefault(run.learned.key, []).append(f"{run.suite}/{run.region}")
+        known = set(TrainingRecord.model_fields)
+        return [
+            Learned.model_validate(one.model_dump(include=known) | {"asked": sorted(asked[key])})
+            for key, one in sorted(found.items())
+        ]
 
 
 def find_entries(

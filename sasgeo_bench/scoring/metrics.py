@@ -4,6 +4,7 @@
 To add a metric, write its function and add one row to `METRICS`.
 """
 
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from typing import Any, Final
@@ -60,8 +61,14 @@ def _off_inside(scores: pd.DataFrame) -> Floats:
 
 
 def _flight_mean(name: str, meaning: str, **more: Any) -> MeanMetric:  # noqa: ANN401 - other fields of the metric
-    fields: dict[str, Any] = {"source": "mean over flights", "values": partial(_column, name=name)}
-    return MeanMetric(name=name, meaning=meaning, tracks=(SEQUENCE,), **(fields | more))
+    usual = MeanMetric(
+        name=name,
+        meaning=meaning,
+        source="mean over flights",
+        tracks=(SEQUENCE,),
+        values=partial(_column, name=name),
+    )
+    return replace(usual, **more)
 
 
 _amount = partial(_flight_mean, bounds=(0.0, _INF))

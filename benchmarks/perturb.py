@@ -19,47 +19,12 @@ from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
+from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED
 from sasgeo_bench.tasks.perturbations.base import Perturbation, share_changed, share_hidden
-from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp
-from sasgeo_bench.tasks.perturbations.occlusion import (
-    AdversarialMask,
-    Border,
-    CanopyAndShadow,
-    CentralCrop,
-    FalseUnknown,
-    Glare,
-    Rectangles,
-    TiltWedge,
-)
-from sasgeo_bench.tasks.perturbations.perception import Perception
-from sasgeo_bench.tasks.perturbations.season import Season
 
 TOWNS = ("town-suburb", "town-riverside", "town-agricultural")
 VIEWS_PER_TOWN = 4
 SIZE_CELLS = 192
-
-RATES = rates_by_hand()
-MEASURED: dict[str, Perturbation] = {
-    "perception, in domain": Perception(error_factor=1.0),
-    "perception, across domains": Perception(error_factor=2.0),
-    "rectangles 0.3": Rectangles(share=0.3),
-    "rectangles 0.6": Rectangles(share=0.6),
-    "border 0.3": Border(share=0.3),
-    "tilt wedge 0.3": TiltWedge(share=0.3),
-    "glare 0.2": Glare(share=0.2),
-    "canopy and shadow 0.6": CanopyAndShadow(share=0.6),
-    "adversarial mask 0.3": AdversarialMask(share=0.3),
-    "false unknown 0.2": FalseUnknown(share=0.2),
-    "local warp 10 m": LocalWarp(rms_m=10.0),
-    "central crop 0.3": CentralCrop(share=0.3),
-    "leaf on 0.5": Season(kind="leaf_on", strength=0.5),
-    "snow 0.5": Season(kind="snow", strength=0.5),
-    "low water 0.5": Season(kind="low_water", strength=0.5),
-    "harvest 0.5": Season(kind="harvest", strength=0.5),
-    "ageing 10 years": Ageing(years=10.0, rates=RATES, place="-"),
-    "ageing 30 years": Ageing(years=30.0, rates=RATES, place="-"),
-}
 
 
 def town_views() -> list[Evidence]:
@@ -103,7 +68,7 @@ def main() -> None:
     views = town_views()
     print(f"{len(views)} views of {SIZE_CELLS} x {SIZE_CELLS} cells, {len(views[0].classes)} classes")
     print(f"{'':28} {'ms':>6} {'changed':>8} {'hidden':>7}")
-    for name, perturbation in MEASURED.items():
+    for name, perturbation in SHIPPED.items():
         after = [perturbation(view, np.random.default_rng(index)) for index, view in enumerate(views)]
         changed = statistics.fmean(map(share_changed, views, after))
         hidden = statistics.fmean(map(share_hidden, views, after))

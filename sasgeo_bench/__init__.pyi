@@ -75,6 +75,7 @@ from .regions.region import MapGraph as MapGraph
 from .regions.region import Region as Region
 from .regions.region_files import read_imagery as read_imagery
 from .regions.region_files import read_region as read_region
+from .running.perturbation_testing import check_perturbation as check_perturbation
 from .running.prediction_files import PREDICTION_SCHEMA as PREDICTION_SCHEMA
 from .running.prediction_files import read_predictions as read_predictions
 from .running.segmenter_testing import check_segmenter as check_segmenter
@@ -91,6 +92,8 @@ from .sasgeo.nodes import Nodes as Nodes
 from .sasgeo.observed import ObservedGraph as ObservedGraph
 from .sasgeo.variants import map_by_hand as map_by_hand
 from .sasgeo.variants import view_by_hand as view_by_hand
+from .scoring.metric import MeanMetric as MeanMetric
+from .scoring.metric_testing import check_metric as check_metric
 from .search.belief import GridBelief as GridBelief
 from .search.belief import pooled_logs as pooled_logs
 from .search.belief import prepare_levels as prepare_levels
@@ -139,8 +142,12 @@ from .sensing.tiny_images import tiny_images as tiny_images
 from .sensing.tiny_images import with_picture as with_picture
 from .tasks.frames import Frame as Frame
 from .tasks.perturbations.base import Occlusion as Occlusion
+from .tasks.perturbations.base import check_ranges as check_ranges
+from .tasks.perturbations.base import find_objects as find_objects
 from .tasks.perturbations.base import hide as hide
 from .tasks.perturbations.base import smooth_noise as smooth_noise
+from .tasks.perturbations.base import with_cells as with_cells
+from .tasks.perturbations.streams import Streams as Streams
 from .tasks.query import Query as Query
 from .tasks.query import Step as Step
 from .tasks.query import Truth as Truth

@@ -56,9 +56,24 @@ Kind = Literal["regions", "splits", "pipelines"]
 
 
 class Document(BaseModel):
-    """Base of every model read from TOML: frozen, unknown keys refused, no silent conversion."""
+    """Base of every model read from TOML: frozen, unknown keys refused, no silent conversion.
+
+    Keys of `without_empty` came after the first edition: they are left out where they are empty, so that older files
+    keep their bytes and their hashes.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+    without_empty: ClassVar[frozenset[str]] = frozenset()
+
+    @model_serializer(mode="wrap")
+    def _as_written(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
+        return {name: value for name, value in handler(self).items() if value or name not in self.without_empty}
+
+
+class JsonDocument(Document):
+    """Base of strict JSON records: JSON has no tuples and no dates, so ordinary conversion is allowed."""
+
+    model_config = ConfigDict(strict=False)
 
 
 class Record(BaseModel):
@@ -84,7 +99,7 @@ class Record(BaseModel):
         return made
 
     @model_serializer(mode="wrap")
-    def _as_made(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _as_made(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
         found = handler(self)
         keys = dict.fromkeys((*self._keys, *(name for name in found if name in self.model_fields_set)))
         return {name: found[name] for name in keys if name in found and (found[name] or name not in self.without_empty)}

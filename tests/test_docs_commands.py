@@ -67,7 +67,7 @@ ONLY_PARSED = {
 }
 # Commands of other programs that are not run, each with its reason.
 OTHERS = {
-    r"^pip install -e my-(matcher|segmenter|tracker|suite)$": "done by hand: it needs the package registry",
+    r"^pip install -e my-(matcher|segmenter|tracker|suite|metric|stress)$": "by hand: it needs the package registry",
     r"^(sha256sum |install -m 600 |source \.venv/bin/activate$)": "programs of the system, and of the shell",
     r"^podman ": "downloads and builds an image; tests/test_repository.py reads what it is built by",
     r"^bash findings/": "installs packages from the registry",
@@ -89,6 +89,11 @@ my-matcher = my_matcher.matcher:MyMatcher
 my-segmenter = my_segmenter.segmenter:MySegmenter
 [sasgeo_bench.suites]
 my-suite = my_suite.suite:SUITE
+my-stress = my_stress.suite:SUITE
+[sasgeo_bench.perturbations]
+my-stress = my_stress.perturbation:MyStress
+[sasgeo_bench.metrics]
+my-metric = my_metric.metric:METRIC
 """
 
 
@@ -230,12 +235,8 @@ def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     about.mkdir(parents=True)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my-matcher\nVersion: 0.1.0\n", encoding="utf-8")
     (about / "entry_points.txt").write_text(PLUGIN, encoding="utf-8")
-    for path in (
-        tmp_path / "site",
-        folder / "my-matcher" / "src",
-        folder / "my-segmenter" / "src",
-        folder / "my-suite" / "src",
-    ):
+    kinds = ("matcher", "segmenter", "suite", "stress", "metric")
+    for path in (tmp_path / "site", *(folder / f"my-{kind}" / "src" for kind in kinds)):
         monkeypatch.syspath_prepend(str(path))
     monkeypatch.chdir(folder)
     monkeypatch.delenv("SASGEO_EXTRACTS", raising=False)

@@ -27,7 +27,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.board_files import write_board
 from sasgeo_bench.leaderboard.cases import pixels_of
 from sasgeo_bench.leaderboard.plots import BoardPage, line_keys
-from sasgeo_bench.leaderboard.text import board_latex, board_markdown
+from sasgeo_bench.leaderboard.text import Contents, board_latex, board_markdown
 from sasgeo_bench.matching.matcher import Prediction, RejectorCard
 from sasgeo_bench.publishing.site import environment
 from sasgeo_bench.publishing.site_files import svg_fault
@@ -338,21 +338,26 @@ def test_a_board_of_hostile_names_is_a_table_of_them_in_every_format(tmp_path):
     names += ["=1+1", "a|b [x](javascript:alert(1))", r"\input{x} $\nosuchthing$"]
     board = leaderboard({name: asked(0.5, count=8) for name in dict.fromkeys(names)}, draws=100)
     entries = [entry_of(name, set_apart="- # | <b>") for name in names[:3]]
+    about = about_of(entries)
     verdicts = [Verdict(control="a|b", matcher=names[0], n=4, found=1, expected=0, p=0.0, holds=False)]
-    text = board_markdown(board, about_of(entries), verdicts=verdicts)
+    text = board_markdown(about, Contents(leaderboard=board, entries=about.entries, verdicts=verdicts))
+    plain_names = {name: f"m{at:02d}" for at, name in enumerate(dict.fromkeys(names))}
+    plain_about = about_of([entry_of(f"m{at:02d}", set_apart="x") for at in range(3)])
     plain_text = board_markdown(
-        board.assign(
-            matcher=board["matcher"].map({name: f"m{at:02d}" for at, name in enumerate(dict.fromkeys(names))})
+        plain_about,
+        Contents(
+            leaderboard=board.assign(matcher=board["matcher"].map(plain_names)),
+            entries=plain_about.entries,
+            verdicts=[Verdict(control="c", matcher="m00", n=4, found=1, expected=0, p=0.0, holds=False)],
         ),
-        about_of([entry_of(f"m{at:02d}", set_apart="x") for at in range(3)]),
-        verdicts=[Verdict(control="c", matcher="m00", n=4, found=1, expected=0, p=0.0, holds=False)],
     )
     assert [one.type for one in parsed(text)] == [one.type for one in parsed(plain_text)]
     assert not {"link_open", "image", "html_inline"} & {
         part.type for one in parsed(text) for part in one.children or ()
     }
-    assert not re.search(r"(?<!\\)\\(?:input|end\{(?!table|tabular))", board_latex(board, about_of([])))
-    about = about_of(entries)
+    assert not re.search(
+        r"(?<!\\)\\(?:input|end\{(?!table|tabular))", board_latex(about_of([]), Contents(leaderboard=board))
+    )
     write_board(tmp_path / "board", tables={"leaderboard": board}, about=about)
     back = list(csv.reader((tmp_path / "board" / "leaderboard.csv").open(encoding="utf-8", newline="")))
     assert {row[0].removeprefix("'") for row in back[1:]} == {plain(name) for name in names}

@@ -38,7 +38,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.progress import duration_text
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES
-from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.regions.region import Manifest, Provenance
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
 from sasgeo_bench.running.prediction_files import PART_SCHEMA
 from sasgeo_bench.scoring.metric import CostMetric, MeanMetric, Metric, QuantileMetric, RejectionMetric, ThresholdMetric
@@ -66,7 +66,10 @@ STAGES: Final = {
     "leaderboard": "Boards and queries in a notebook",
 }
 _MODELS: Final[dict[str, tuple[str, Mapping[str, type[BaseModel]]]]] = {
-    "Region file": ("`regions/*.toml`", {"": RegionFile, "[[extract]]": Extract, "town": TownEntry}),
+    "Region file": (
+        "`regions/*.toml`",
+        {"": RegionFile, "[[extract]]": Extract, "town": TownEntry, "[provenance]": Provenance},
+    ),
     "Split file": ("`splits/*.toml`", {"": SplitFile, "[[place]]": Place}),
     "Pipeline file": (
         "`pipelines/*.toml`",
@@ -307,7 +310,12 @@ def _model(model: type[BaseModel]) -> Iterator[str]:
     schema = model.model_json_schema()
     said, needed = meanings([model]), schema.get("required", ())
     rows = (
-        (f"`{name}`", _kind(about), "required" if name in needed else f"`{about.get('default')!r}`", said.get(name, ""))
+        (
+            f"`{name}`",
+            _kind(about),
+            "required" if name in needed else f"`{about.get('default')!r}`",
+            said.get(name) or about.get("description", ""),
+        )
         for name, about in schema["properties"].items()
     )
     head = ("Key", "Value", "Default", "What it is")

@@ -7,7 +7,7 @@ from functools import partial
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
 
@@ -96,10 +96,13 @@ def _beside(summary: pd.DataFrame, matchers: Sequence[str]) -> pd.DataFrame:
             one = by_metric[metric]
             if not math.isnan(one["paper"]):
                 row[f"{title}, paper"] = shown(one["paper"], one["paper_lo"], one["paper_hi"])
-            row[f"{title}, ours"] = shown(one["value"], *used_interval(one))
+            wilson, clusters = (one["lo"], one["hi"]), (one["cluster_lo"], one["cluster_hi"])
+            row[f"{title}, ours"] = shown(
+                one["value"], *used_interval(one["cluster"], wilson=wilson, clusters=clusters)
+            )
             if metric == "recall_1":
                 is_tile = one["cluster"] == "tile"
-                other = (one["cluster_lo"], one["cluster_hi"]) if is_tile else (one["lo"], one["hi"])
+                other = clusters if is_tile else wilson
                 row["by tiles" if is_tile else "Wilson"] = shown(one["value"], *other).partition(" ")[2] or "-"
         rows.append(row | {"n": str(by_metric["recall_1"]["n"])})
     return pd.DataFrame(rows).fillna("-")
@@ -128,10 +131,9 @@ def _readings(every: pd.DataFrame, known: Sequence[str]) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, dict[str, Any]]:
+def _by_metric(summary: pd.DataFrame, matcher: str) -> dict[str, pd.Series]:
     """Return the rows of one matcher by metric."""
-    rows = summary[summary["matcher"] == matcher].to_dict("records")
-    return {str(row["metric"]): {str(name): value for name, value in row.items()} for row in rows}
+    return {str(row["metric"]): row for _, row in summary[summary["matcher"] == matcher].iterrows()}
 
 
 def shown(value: float, lo: float = math.nan, hi: float = math.nan) -> str:
@@ -154,7 +156,7 @@ def difference_lines(summary: pd.DataFrame) -> Iterator[str]:
             yield f"**{item.title}**: {'; '.join(parts)}."
 
 
-def _difference(row: Mapping[str, Any]) -> str:
+def _difference(row: pd.Series) -> str:
     ours, paper = shown(row["value"]), shown(row["paper"])
     if ours == paper:
         return f"{ours}, as in the paper"
@@ -164,7 +166,8 @@ def _difference(row: Mapping[str, Any]) -> str:
         return f"{start}inside our interval"
     if math.isnan(row["paper_lo"]):
         return f"{start}outside our interval"
-    lo, hi = used_interval(row)
+    clusters = (row["cluster_lo"], row["cluster_hi"])
+    lo, hi = used_interval(row["cluster"], wilson=(row["lo"], row["hi"]), clusters=clusters)
     meet = lo <= row["paper_hi"] and row["paper_lo"] <= hi
     return f"{start}outside our interval, {'though the two overlap' if meet else 'and the two do not overlap'}"
 

@@ -217,12 +217,12 @@ def decoys_frame(region: Region, *, seed: int, trials: int, readings: Sequence[D
     return pd.DataFrame(rows)
 
 
-def _figures(drawn: DecoyTrials, ranked: Ranked) -> dict[str, Any]:
+def _figures(drawn: DecoyTrials, ranked: Ranked) -> dict[str, float]:
     """Return figures with intervals, and how many of the paper's lie inside."""
     values = drawn.figures(ranked)
     resampled = ClusterDraws(blocks=drawn.tile, seed=seed_of_text("paper decoys"), draws=DRAWS)
     means = bootstrap_means(values, resampled)
-    row: dict[str, Any] = {}
+    row: dict[str, float] = {}
     inside = inside_wilson = 0
     for at, name in enumerate(_FIGURES):
         wilson = wilson_mean(values[:, at])

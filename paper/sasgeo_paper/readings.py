@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, Final, get_args
+from typing import Final, get_args
 
 import pandas as pd
 
@@ -44,7 +44,7 @@ def with_gaps(
     return pd.concat([summary.assign(crop=crop), pd.DataFrame(gaps, index=summary.index)], axis=1)
 
 
-def _gap(crop: Crop, rows: pd.DataFrame, first: pd.DataFrame, draws: int) -> dict[str, Any]:
+def _gap(crop: Crop, rows: pd.DataFrame, first: pd.DataFrame, draws: int) -> dict[str, float]:
     """Return the paired difference of one matcher."""
     shared = sorted(set(rows["pair_id"]) & set(first["pair_id"]))
     here, there = (frame.set_index("pair_id", drop=False).loc[shared] for frame in (rows, first))

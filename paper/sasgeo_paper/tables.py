@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -146,22 +146,25 @@ def summary_frame(trials: pd.DataFrame, board: pd.DataFrame) -> pd.DataFrame:
         for metric in METRICS:
             found = wilson_mean(own[metric].to_numpy(float)) if is_asked else _NOTHING
             over = _over_clusters(whole, matcher, metric)
-            row: dict[str, Any] = {
-                "matcher": matcher,
-                "title": title_of(matcher),
-                "metric": metric,
-                **_published(paper, metric),
-                "value": found.value,
-                "lo": found.lo,
-                "hi": found.hi,
-                "n": len(own),
-                "cluster": "tile" if seeds == 1 else "seed",
-                "clusters": int(own["block"].nunique()),
-                "cluster_lo": over.lo,
-                "cluster_hi": over.hi,
-            }
-            lo, hi = used_interval(row)
-            rows.append(row | {"is_within": bool(lo <= row["paper"] <= hi)})
+            published, cluster = _published(paper, metric), "tile" if seeds == 1 else "seed"
+            lo, hi = used_interval(cluster, wilson=(found.lo, found.hi), clusters=(over.lo, over.hi))
+            rows.append(
+                {
+                    "matcher": matcher,
+                    "title": title_of(matcher),
+                    "metric": metric,
+                    **published,
+                    "value": found.value,
+                    "lo": found.lo,
+                    "hi": found.hi,
+                    "n": len(own),
+                    "cluster": cluster,
+                    "clusters": int(own["block"].nunique()),
+                    "cluster_lo": over.lo,
+                    "cluster_hi": over.hi,
+                    "is_within": bool(lo <= published["paper"] <= hi),
+                }
+            )
     return pd.DataFrame(rows)
 
 
@@ -181,10 +184,9 @@ def _over_clusters(whole: pd.DataFrame, matcher: str, metric: str) -> Interval:
     return Interval(value=float(row["value"]), lo=float(row["lo"]), hi=float(row["hi"]))
 
 
-def used_interval(row: Mapping[str, Any]) -> tuple[float, float]:
+def used_interval(cluster: str, *, wilson: tuple[float, float], clusters: tuple[float, float]) -> tuple[float, float]:
     """Return our interval that is compared with the paper's figure: Wilson's for one seed, over seeds for several."""
-    is_wilson = row["cluster"] == "tile" or math.isnan(row["cluster_lo"])
-    return (row["lo"], row["hi"]) if is_wilson else (row["cluster_lo"], row["cluster_hi"])
+    return wilson if cluster == "tile" or math.isnan(clusters[0]) else clusters
 
 
 def robustness_frame(trials: pd.DataFrame) -> pd.DataFrame:

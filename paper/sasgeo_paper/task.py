@@ -93,7 +93,9 @@ def make_paper_task(
     folder = build_made(_spec(seed), _generated(seed, seeds), out=out)
     drawer = PaperDrawer.of(region_files.read_region(folder), seeds, crop=crop)
     pairs = sorted((drawer.draw(index) for index in range(trials)), key=lambda pair: pair[0].query_id)
-    hidden = TruthManifest(**seed_record(private or seed), request_sha256=_request_sha256(seed, trials, private, crop))
+    hidden = TruthManifest.model_validate(
+        seed_record(private or seed) | {"request_sha256": _request_sha256(seed, trials, private, crop)}
+    )
     views_cells = sorted({query.evidence.shape[0] for query, _ in pairs})
     made = put_task(pairs, _origin(drawer.region, crop, views_cells), hidden, out=out)
     tell(f"{paper_suite(crop)} on {region_name(seed)}: {made.manifest.queries} trials in {made.folder}")
@@ -211,6 +213,7 @@ def _origin(region: Region, crop: Crop, views_cells: list[int]) -> TaskOrigin:
         map_date=region.manifest.extract.date.isoformat(),
         map_fingerprint=region.manifest.fingerprint,
         map_inputs_sha256=region.manifest.inputs_sha256,
+        provenance=region.manifest.provenance,
         sites=TILES,
         views_cells=views_cells,
         epsg=region.manifest.epsg,

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw `ageing.svg`: yearly rates of each class with their intervals, and the result of comparing ids instead."""
 
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import matplotlib as mpl
 import numpy as np
@@ -116,11 +117,11 @@ def _dress(chart: Axes, title: str, rows: int) -> None:
 
 
 def _keys() -> list[Line2D]:
-    common: dict[str, Any] = {"ls": "", "marker": "o"}
+    mark = partial(Line2D, [], [], ls="", marker="o")
     return [
         Line2D([], [], color=_POOLED, marker="o", ms=5, lw=1.6, label="rate over all intervals, 95 %"),
-        Line2D([], [], color=mpl.colormaps["viridis"](0.0), ms=4, label="one interval, early", **common),
-        Line2D([], [], color=mpl.colormaps["viridis"](_LATE), ms=4, label="one interval, late", **common),
+        mark(color=mpl.colormaps["viridis"](0.0), ms=4, label="one interval, early"),
+        mark(color=mpl.colormaps["viridis"](_LATE), ms=4, label="one interval, late"),
         Line2D(
             [],
             [],
@@ -132,6 +133,6 @@ def _keys() -> list[Line2D]:
             mew=1.4,
             label="first map to last, by geometry (amount)",
         ),
-        Line2D([], [], color="none", mec=_WHOLE, ms=5, mew=1.4, label="the same, by number", **common),
+        mark(color="none", mec=_WHOLE, ms=5, mew=1.4, label="the same, by number"),
         Line2D([], [], color=_BY_ID, marker="s", ms=6, ls="", label="by id"),
     ]

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.table import Table
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, RegionFolders, takes
@@ -17,12 +16,20 @@ from sasgeo_bench.experiments.head_start import packed_for, unpack_head_start
 from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.board_tables import Book, contrast_table, risk_tables, summary
 from sasgeo_bench.leaderboard.manifests import SeedRecord
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
-from sasgeo_bench.leaderboard.tables import text_of
-from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, warnings_of
+from sasgeo_bench.leaderboard.text import (
+    TERMINAL,
+    Contents,
+    control_lines,
+    map_lines,
+    metric_lines,
+    segmenter_lines,
+    table_text,
+    tables_of,
+    warnings_of,
+)
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.archive_file import is_pack
@@ -58,6 +65,10 @@ Rejectors = Annotated[
         help="name from list rejectors, or module:Class; may be repeated; default: none, or those of stored results"
     ),
 ]
+Metrics = Annotated[
+    list[str] | None,
+    typer.Option(help="one more than every board has: a name from list metrics, or module:NAME; may be repeated"),
+]
 Submissions = Annotated[
     list[Path] | None,
     typer.Option(help="a submission, or a folder of them, for stored results; those for their board are scored"),
@@ -91,6 +102,7 @@ class ScoreOptions(Options):
         ),
     ] = None
     rejector: Rejectors = None
+    metric: Metrics = None
     submissions: Submissions = None
     private: Private = None
     region_files: RegionFolders = None
@@ -146,6 +158,7 @@ def score(options: ScoreOptions) -> Board:
     request = replace(
         usual,
         tasks=options.tasks or (),
+        metrics=options.metric or (),
         truth=options.truth,
         draws=options.draws or usual.draws,
         without=options.without or (),
@@ -291,17 +304,13 @@ def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) 
 
 def show_board(board: Board) -> None:
     """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
-    risks = risk_tables(board.leaderboard)
-    tables = (*summary(Book.of(board.leaderboard)), contrast_table(board.findings), *risks)
-    for table in (one for one in tables if one.rows):
+    kinds = tables_of(Contents(leaderboard=board.leaderboard, findings=board.findings), TERMINAL)
+    for table in (one for tables in kinds.values() for one in tables if one.rows):
         say(table.title)
-        shown = Table(*(column.name for column in table.columns), box=None, pad_edge=False)
-        for row in table.rows:
-            shown.add_row(*map(text_of, row.cells))
-        print_table(shown)
-    for line in dict.fromkeys(note for table in risks if table.rows for note in table.notes):
+        print_table(table_text(table))
+    for line in dict.fromkeys(note for table in kinds["risk"] for note in table.notes):
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
-    for line in (*map_lines(board.about), *warnings_of(board.leaderboard)):
+    for line in (*map_lines(board.about), *warnings_of(board.leaderboard), *metric_lines(board.about)):
         tell(line)

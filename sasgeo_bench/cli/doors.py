@@ -4,8 +4,8 @@
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import fields
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
@@ -16,11 +16,13 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, complain, print_table, say
 from sasgeo_bench.cli.options import RegionFolders
-from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.errors import ConfigError, MatchError, counted
 from sasgeo_bench.files.plugins import (
     MATCHERS,
+    METRICS,
     ORACLE,
     ORACLE_SEGMENTER,
+    PERTURBATIONS,
     REJECTORS,
     SEGMENTERS,
     SUITES,
@@ -68,7 +70,18 @@ _DOORS: Final = {
         "tasks.suites.all_suites:find_suite",
         "running.suite_testing:check_suite",
     ),
+    "metric": _Door(
+        METRICS,
+        "scoring.metric_plugins:find_metric",
+        "scoring.metric_testing:check_metric",
+    ),
+    "perturbation": _Door(
+        PERTURBATIONS,
+        "tasks.perturbations.all_perturbations:find_perturbation",
+        "running.perturbation_testing:check_perturbation",
+    ),
 }
+_IN_PROCESS: Final = ("suite", "metric", "perturbation")  # which run inside the program, without a sandbox
 
 
 class Listed(StrEnum):
@@ -80,6 +93,8 @@ class Listed(StrEnum):
     TRACKERS = "trackers"
     SEGMENTERS = "segmenters"
     REJECTORS = "rejectors"
+    METRICS = "metrics"
+    PERTURBATIONS = "perturbations"
 
 
 class New(StrEnum):
@@ -89,6 +104,8 @@ class New(StrEnum):
     TRACKER = "tracker"
     SEGMENTER = "segmenter"
     SUITE = "suite"
+    METRIC = "metric"
+    PERTURBATION = "perturbation"
 
 
 def list_command(
@@ -98,7 +115,7 @@ def list_command(
     ] = None,
     regions: RegionFolders = None,
 ) -> None:
-    """List regions, suites or installed plugins, and where each comes from; or show the card of one."""
+    """List regions, suites, metrics or installed plugins, and where each comes from; or show the card of one."""
     if kind is Listed.REGIONS:
         if name is not None:
             raise ConfigError(f"a region has no card: sasgeo-bench inspect {one_line(name)} shows a built one")
@@ -108,9 +125,12 @@ def list_command(
     if name is not None and name == door.control:
         say(f"{name}: a control, given the truth, and has no card")
     elif name is not None:
-        _show(_function(door.load)(name).card)
+        found = _function(door.load)(name)
+        _show(getattr(found, "card", found))
     elif kind is Listed.SUITES:
         _list_suites()
+    elif kind is Listed.METRICS:
+        _list_metrics()
     else:
         _list(kind.removesuffix("s"), door)
 
@@ -125,6 +145,11 @@ def _list(kind: str, door: _Door) -> None:
         name: (point.dist.name if point.dist is not None else "", point.value)
         for name, point in list_entry_points(door.group).items()
     }
+    if kind == "perturbation":
+        from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED  # noqa: PLC0415
+
+        ours = {name: type(one) for name, one in SHIPPED.items()}
+        rows |= {name: ("sasgeo-bench", f"{one.__module__}:{one.__name__}") for name, one in ours.items()}
     if door.control:
         rows[door.control] = ("sasgeo-bench", "a control, given the truth")
     table = Table(kind, "package", "class", box=None, pad_edge=False)
@@ -155,22 +180,45 @@ def _list_regions(folders: Iterable[Path] | None) -> None:
 def _list_suites() -> None:
     from sasgeo_bench.tasks.suites.all_suites import find_suite, list_suites  # noqa: PLC0415
 
-    table = Table("suite", "title", "tracks", "per site", "separates", box=None, pad_edge=False)
-    for name in list_suites():
-        try:
-            suite = find_suite(name)
-        except ConfigError as error:  # of another package: the others are listed all the same
-            tell(f"left out: {error}")
-            continue
+    def row(name: str) -> tuple[str, ...]:
+        suite = find_suite(name)
         per_site = sum(len(suite.tracks(variant)) for variant in suite.variants)
-        table.add_row(name, suite.card.title, ", ".join(suite.card.tracks), str(per_site), suite.card.separates)
+        return suite.card.title, ", ".join(suite.card.tracks), str(per_site), suite.card.separates
+
+    _list_rows(("suite", "title", "tracks", "per site", "separates"), list_suites(), row)
+
+
+def _list_metrics() -> None:
+    from sasgeo_bench.scoring.metric_plugins import find_metric, list_metrics  # noqa: PLC0415
+
+    def row(name: str) -> tuple[str, ...]:
+        one = find_metric(name)
+        return one.unit, one.better, "{:g} to {:g}".format(*one.bounds), one.meaning
+
+    _list_rows(("metric", "unit", "better", "bounds", "what it says"), list_metrics(), row)
+
+
+def _list_rows(heads: Sequence[str], names: Iterable[str], row: Callable[[str], tuple[str, ...]]) -> None:
+    """Print a row for each name; what another package does not hold is told, and the others are listed all the same."""
+    table = Table(*heads, box=None, pad_edge=False)
+    for name in names:
+        try:
+            table.add_row(name, *row(name))
+        except (ConfigError, MatchError) as error:
+            tell(f"left out: {error}")
     print_table(table)
 
 
 def _show(card: object) -> None:
     """Print what a card says, a field after the other; what it leaves empty is left out."""
-    for field in fields(card):  # type: ignore[arg-type]
+    if not is_dataclass(card) or isinstance(card, type):  # a class, or a function, of a strength
+        name = f"{getattr(card, '__module__', '')}:{getattr(card, '__qualname__', card)}"
+        say(plain(f"{name}: {(getattr(card, '__doc__', '') or '').strip().partition(chr(10))[0]}"))
+        return
+    for field in fields(card):
         value = getattr(card, field.name)
+        if callable(value):
+            continue
         text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
         if text:
             say(f"{field.name.replace('_', ' ')}: {plain(text)}")
@@ -182,9 +230,11 @@ def new_command(
     folder: Annotated[Path | None, typer.Option("--into", help="an empty folder; default: one of that name")] = None,
 ) -> None:
     """Write a plugin package that passes `check` at once, for you to put your method into."""
-    from sasgeo_bench.matching.scaffold import package_files  # noqa: PLC0415
-
-    lay_package(name, folder, package_files(kind, name))
+    if kind is New.METRIC:
+        files = _function("scoring.metric_testing:metric_files")(name)
+    else:
+        files = _function("matching.scaffold:package_files")(kind, name)
+    lay_package(name, folder, files)
     if kind is New.MATCHER:
         entry = f"sasgeo-bench enter docs/results/systems-objects --matcher {name}"
         tell(f"later: {entry} (docs/howto/matcher.md walks the path)")
@@ -217,29 +267,37 @@ def check_command(
     ] = None,
     trusted: Annotated[bool, typer.Option("--trusted", help="run without the sandbox")] = False,
 ) -> None:
-    """Try a matcher, tracker, segmenter or suite on a tiny town, and print a row for each rule that all keep."""
-    found = kind or _kind_of(name)
-    check = _function(str(_DOORS[found].check))
-    rows: Iterator[Any] = check(name) if found == "suite" else check(name, is_shut_in=not trusted)
-    table = Table("check", "outcome", "found", box=None, pad_edge=False)
-    failed = 0
-    for row in rows:
-        failed += row.outcome == "fail"
-        table.add_row(row.name, row.outcome, row.found)
-    print_table(table)
+    """Try a plugin of any kind but a rejector on a tiny town, and print a row for each rule that its kind keeps."""
+    failed, kinds = 0, [str(kind)] if kind else _kinds_of(name)
+    for found in kinds:
+        check = _function(str(_DOORS[found].check))
+        rows: Iterator[Any] = check(name) if found in _IN_PROCESS else check(name, is_shut_in=not trusted)
+        table = Table(
+            "check" if len(kinds) == 1 else f"check of a {found}", "outcome", "found", box=None, pad_edge=False
+        )
+        for row in rows:
+            failed += row.outcome == "fail"
+            table.add_row(row.name, row.outcome, row.found)
+        print_table(table)
     if failed:
         complain(f"{name}: {counted(failed, 'check')} failed")
         raise typer.Exit(EXIT_USER)
 
 
-def _kind_of(name: str) -> str:
-    """Return the first kind that has a plugin of a name; a class of one's own is a matcher."""
+def _kinds_of(name: str) -> list[str]:
+    """Return the kind of a name, or all kinds of what runs inside the program; a class of one's own is a matcher."""
     if ":" in name:
-        return "matcher"
+        return ["matcher"]
+    from sasgeo_bench.scoring.metric_plugins import SHIPPED as METRICS_OF_OURS  # noqa: PLC0415
+    from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED  # noqa: PLC0415
     from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE  # noqa: PLC0415
 
+    ours = {"suite": EVERY_SUITE, "metric": METRICS_OF_OURS, "perturbation": SHIPPED}
     checked = [kind for kind, door in _DOORS.items() if door.check]
-    found = next((kind for kind in checked if name in list_entry_points(_DOORS[kind].group)), None)
-    if found is None and name not in EVERY_SUITE:
-        raise unknown(name, *(_DOORS[kind].group for kind in checked), others=EVERY_SUITE)
-    return found or "suite"
+    found = [kind for kind in checked if name in ours.get(kind, ()) or name in list_entry_points(_DOORS[kind].group)]
+    if found and found[0] not in _IN_PROCESS:
+        return found[:1]
+    if not found:
+        others = [each for names in ours.values() for each in names]
+        raise unknown(name, *(_DOORS[kind].group for kind in checked), others=others)
+    return found

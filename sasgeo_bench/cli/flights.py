@@ -189,14 +189,10 @@ def _read_runs(truth: list[Path], estimate: list[Path], lost_s: float, axes: Axe
 def _check_outputs(inputs: list[Path], outputs: list[Path]) -> None:
     """Refuse to write a file over an input, or two into one."""
     for at, path in enumerate(outputs):
-        if path in outputs[:at] or any(_is_same(path, other) for other in inputs):
+        if path in outputs[:at] or any(path.exists() and other.exists() and path.samefile(other) for other in inputs):
             raise FlightError(f"{path} is named twice, to read from and to write to: name another file")
         if path.is_dir():
             raise FlightError(f"{path} cannot be written (Is a directory): name another place")
-
-
-def _is_same(path: Path, other: Path) -> bool:
-    return path.exists() and other.exists() and path.samefile(other)
 
 
 def _table_of(figures: pd.DataFrame) -> Table:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands about datasets of other benchmarks: import one, score a ranking of it, find the map under it."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,7 @@ from rich.table import Table
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out, RegionFolders
 from sasgeo_bench.errors import counted, named
-from sasgeo_bench.importers.items import Box, Dataset, Role
+from sasgeo_bench.importers.items import Dataset, Role
 from sasgeo_bench.importers.kinds import IMPORTERS, read_dataset
 from sasgeo_bench.importers.reports import Report
 from sasgeo_bench.progress import tell
@@ -55,14 +54,14 @@ def locate_dataset_command(folder: Folder, *, kind: Kind, regions: RegionFolders
     for title in ("regions that cover it", "regions in part", "regional extracts"):
         table.add_column(title)
     for number, extent in enumerate(extents, start=1):
-        centre = extent.box.centre
+        box, centre = extent.box, extent.box.centre
         table.add_row(
             named(extent.groups, "group") if extent.groups else str(number),
             str(extent.items),
             f"[{centre.longitude_deg:.4f}, {centre.latitude_deg:.4f}]",
             f"{extent.width_km:.1f} x {extent.height_km:.1f}",
-            _bounds(extent.box),
-            *(_names(names) for names in (extent.covered_by, extent.touched_by, extent.extracts)),
+            ",".join(f"{side:.4f}" for side in (box.west_deg, box.south_deg, box.east_deg, box.north_deg)),
+            *(", ".join(names) or "-" for names in (extent.covered_by, extent.touched_by, extent.extracts)),
         )
     print_table(table)
     tell(
@@ -98,11 +97,3 @@ def _value(value: float | None, unit: str) -> str:
     if value is None:
         return "-"
     return f"{value:.1f} m" if unit == "m" else f"{value:.4f}"
-
-
-def _bounds(box: Box) -> str:
-    return ",".join(f"{side:.4f}" for side in (box.west_deg, box.south_deg, box.east_deg, box.north_deg))
-
-
-def _names(names: Sequence[str]) -> str:
-    return ", ".join(names) or "-"

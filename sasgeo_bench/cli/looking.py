@@ -270,6 +270,8 @@ def _summary(manifest: Manifest, folder: Path, preview: Path) -> Table:
     table.add_row("graph", graph)
     table.add_row("preview", str(preview))
     table.add_row("licence", f"{manifest.licence}, {manifest.attribution}")
+    for title, text in manifest.provenance.titled().items():
+        table.add_row(title, text)
     return table
 
 

@@ -87,7 +87,7 @@ class Options:
             object.__setattr__(self, name, _read(getattr(self, name), name, kind))
 
 
-def flags_of(options: type) -> dict[str, Any]:
+def flags_of(options: type) -> dict[str, object]:
     """Names and annotations of the flags of an options object, in their order."""
     hints = get_type_hints(options, include_extras=True)
     return {item.name: hints[item.name] for item in fields(options) if get_origin(hints[item.name]) is Annotated}
@@ -134,7 +134,7 @@ def takes(options: Callable[Words, Object]) -> Callable[[Callable[[Object], Resu
         others = [item for name, item in words.items() if name not in kinds]
         signature = inspect.signature(function).replace(parameters=[*plain, *others])
         called.__signature__ = signature  # type: ignore[attr-defined]
-        lines = [f"{item.name} : {_shown(item.annotation)}\n    {_help(kinds[item.name])}" for item in plain]
+        lines = [f"{item.name} : {_shown(item.annotation)}\n    {get_args(kinds[item.name])[1].help}" for item in plain]
         summary, rule, rest = inspect.cleandoc(function.__doc__ or "").partition("\n\nReturns\n")
         called.__doc__ = f"{summary}\n\nParameters\n----------\n" + "\n".join((*lines, _OTHERS)) + rule + rest
         return called
@@ -189,7 +189,3 @@ def _read(value: Any, name: str, kind: Any) -> Any:  # noqa: ANN401 - whatever t
 def _shown(kind: Any) -> str:  # noqa: ANN401 - an annotation
     """Name a type as docstrings do."""
     return inspect.formatannotation(kind).replace("pathlib.", "").replace(" | None", ", optional")
-
-
-def _help(kind: Any) -> str:  # noqa: ANN401 - an annotation
-    return str(get_args(kind)[1].help)

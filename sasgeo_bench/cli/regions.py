@@ -5,7 +5,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -67,9 +67,17 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
     ['out/regions/town-grid@2019-01-01', 'out/regions/town-suburb@2019-01-01']
     """
     specs = [read_region_file(find_region_file(name, folders=options.region_files or ())) for name in options.region]
-    folders: dict[str, Any] = {"extract_folders": options.extracts or (), "imagery_folders": options.imagery or ()}
-    wanted = {"out": options.out, "date": read_date(options.date), "with_preview": True, **folders}
-    plans = [build.plan_build(spec, **wanted) for spec in specs]
+    plans = [
+        build.plan_build(
+            spec,
+            out=options.out,
+            date=read_date(options.date),
+            extract_folders=options.extracts or (),
+            imagery_folders=options.imagery or (),
+            with_preview=True,
+        )
+        for spec in specs
+    ]
     if options.dry_run:
         options.say("\n".join(plan.to_text() for plan in plans))
     else:

@@ -154,7 +154,8 @@ def _check_seed(stored: Path, seed: PrivateSeed | None) -> None:
 def _asking(spec: PipelineFile, matchers: Sequence[str]) -> PipelineFile:
     """Return a pipeline that asks some matchers all of its queries, and compares nothing."""
     tasks = [task.model_copy(update={"matchers": []}) for task in spec.task]
-    return spec.model_copy(update={"matchers": list(matchers), "task": tasks, "contrast": [], "rejectors": []})
+    nothing: dict[str, list[str]] = {"contrast": [], "rejectors": [], "metrics": []}
+    return spec.model_copy(update={"matchers": list(matchers), "task": tasks, **nothing})
 
 
 def asked_tasks(stored: Path) -> list[Task]:

@@ -33,6 +33,7 @@ from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.entries import design_rows, rows_to_rank
+from sasgeo_bench.scoring.metric_plugins import find_metrics
 from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.sensing.reference_imagery import render_place
@@ -401,9 +402,10 @@ def plan_pipeline(
     serve regions that are not built yet, and files of one's own. `private` draws all queries instead of the file's
     seed, below `out/private`. `sealed` draws the sealed places of the split, which are left out without it. Raise
     `ConfigError` for an unknown suite, region or split, or if no region can be built here, or learned from, or ranked;
-    `MatchError` for an unknown matcher or rejector.
+    `MatchError` for an unknown matcher, rejector or metric.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
+    find_metrics(spec.metrics)
     experiment = find_experiment(spec)
     out, seed = root_of(out, private), private or spec.seed
     requests: list[Request] = []
@@ -671,6 +673,7 @@ def run_pipeline(
         board=board_folder(plan),
         split=plan.split,
         rejectors=plan.spec.rejectors,
+        metrics=plan.spec.metrics,
         contrasts=contrasts,
         draws=plan.spec.draws,
         pipeline=plan.spec.identity,

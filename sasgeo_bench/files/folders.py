@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 from filelock import FileLock, Timeout
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from sasgeo_bench.config import Document
+from sasgeo_bench.config import JsonDocument
 from sasgeo_bench.errors import SasgeoError, StoreError, named
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.paths import plain_file
@@ -201,10 +201,8 @@ def _flush(path: Path) -> None:
         os.close(descriptor)
 
 
-class FileRecord(Document):
+class FileRecord(JsonDocument):
     """Size and SHA-256 of one file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
     sha256: str
     bytes: Annotated[int, Field(ge=0)]

@@ -8,7 +8,7 @@ machine as its pixels. So can files beside a GeoTIFF: its overviews, its mask, i
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sasgeo_bench.files.paths import plain_file
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def open_geotiff(path: Path, *, has_more: bool = False, **options: Any) -> Iterator["DatasetReader"]:  # noqa: ANN401
-    """Open a GeoTIFF to read; `options` are those of `rasterio.open`.
+def open_geotiff(path: Path, *, has_more: bool = False, overview_level: int | None = None) -> Iterator["DatasetReader"]:
+    """Open a GeoTIFF to read, one of its overviews if `overview_level` counts one.
 
     Files beside it are passed over, unless it `has_more` of its own: a world file, overviews, a mask. Raise
     `RasterioIOError` if it is no GeoTIFF, or one of these names a file that is none of its own.
@@ -27,7 +27,8 @@ def open_geotiff(path: Path, *, has_more: bool = False, **options: Any) -> Itera
     from rasterio.errors import RasterioIOError  # noqa: PLC0415
 
     beside = {} if has_more else {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
-    with rasterio.Env(**beside), rasterio.open(plain_file(path), driver="GTiff", **options) as source:
+    level = {} if overview_level is None else {"overview_level": overview_level}
+    with rasterio.Env(**beside), rasterio.open(plain_file(path), driver="GTiff", **level) as source:
         stray = next((name for name in source.files if not _is_own(Path(name), path)), None) if has_more else None
         if stray is not None:
             raise RasterioIOError(f"a file beside it reads {Path(stray).name}, which is none of its own")

@@ -49,7 +49,7 @@ def read_json(path: Path, *, mend: str, most_bytes: int = MOST_BYTES) -> Any:  #
         raise StoreError(f"{path} is damaged ({text}): {mend}") from error
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     content = dict(pairs)
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow.parquet as pq
 
-CHECKED: Final[Mapping[str, Any]] = {"compression": "zstd", "write_page_checksum": True}
-VERIFIED: Final[Mapping[str, Any]] = {"page_checksum_verification": True}
+CHECKED: Final = {"compression": "zstd", "write_page_checksum": True}
+VERIFIED: Final = {"page_checksum_verification": True}
 MOST_ROWS: Final = 1_000_000  # of a table that is converted to rows
 MOST_VALUES: Final = 100_000_000  # of all columns together, with the items of lists
 _MOST_UNPACKED: Final = 2_000_000_000  # bytes
@@ -65,7 +65,7 @@ def write_table(table: pa.Table, path: Path, *, row_group_size: int | None = Non
         writer.write_table(table, row_group_size)
 
 
-def write_frame(frame: "pd.DataFrame", path: Path, *, attrs: Mapping[str, Any], **metadata: str) -> None:
+def write_frame(frame: "pd.DataFrame", path: Path, *, attrs: Mapping[str, object], **metadata: str) -> None:
     """Write a data frame with checksums, its `attrs`, and further metadata of the file."""
     table = pa.Table.from_pandas(frame, preserve_index=False)
     about = {**(table.schema.metadata or {}), **metadata, _ATTRS: json.dumps(attrs)}

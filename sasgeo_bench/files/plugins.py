@@ -221,6 +221,8 @@ TRACKERS: Final = "sasgeo_bench.trackers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
 SEGMENTERS: Final = "sasgeo_bench.segmenters"
 SUITES: Final = "sasgeo_bench.suites"
+METRICS: Final = "sasgeo_bench.metrics"
+PERTURBATIONS: Final = "sasgeo_bench.perturbations"
 EXPERIMENTS: Final = "sasgeo_bench.experiments"
 CARD_FILE: Final = "card.toml"  # beside a plugin: the one description of a method
 YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are never ranked
@@ -228,13 +230,15 @@ YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are n
 ORACLE: Final = "oracle_pose"
 ORACLE_SEGMENTER: Final = "oracle_segmenter"
 _RESERVED: Final = {MATCHERS: ORACLE, TRACKERS: ORACLE, SEGMENTERS: ORACLE_SEGMENTER}
-_WHAT: Final = {SUITES: "NAME"}  # is named behind a module, where that is no class
+_WHAT: Final = dict.fromkeys((SUITES, METRICS, PERTURBATIONS), "NAME")  # behind a module, where that is no class
 KINDS: Final = {
     MATCHERS: "matcher",
     TRACKERS: "tracker",
     REJECTORS: "rejector",
     SEGMENTERS: "segmenter",
     SUITES: "suite",
+    METRICS: "metric",
+    PERTURBATIONS: "perturbation",
     EXPERIMENTS: "experiment",
 }
 
@@ -353,6 +357,37 @@ def find_plugin(spec: str, group: str) -> Any:  # noqa: ANN401 - any plugin
         raise _failed(one_line(spec), "cannot be imported", error) from error
 
 
+NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")  # of what runs inside the program
+
+
+def find_inside(spec: str, group: str, *, shipped: Collection[str]) -> Any:  # noqa: ANN401 - any plugin
+    """Return what a name, or "module:NAME", stands for, of what runs inside the program; `shipped` are names of ours.
+
+    A module may lie in the working folder. Raise `MatchError` if there is none, with the nearest name.
+    """
+    if isinstance(spec, str) and ":" in spec and os.getcwd() not in sys.path:  # noqa: PTH109 - a text
+        sys.path.insert(0, os.getcwd())  # noqa: PTH109
+    if isinstance(spec, str) and ":" not in spec and spec not in list_entry_points(group):
+        raise unknown(spec, group, others=shipped)
+    return find_plugin(spec, group)
+
+
+def check_own_name(spec: str, name: object, group: str, *, shipped: Collection[str], where: str = "it") -> None:
+    """Raise `MatchError` unless a plugin inside the program has a name of its own, that of its entry point.
+
+    `where` is what says the name.
+    """
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise MatchError(f"{spec}: {where} is named {name!r}: lower-case letters, digits, - and _ make a name")
+    if name in shipped:
+        raise MatchError(f"{spec}: {where} is named {name!r}, as a {KINDS[group]} that ships: rename it")
+    if ":" not in spec and name != spec:
+        raise MatchError(
+            f"{spec}: {where} is named {name!r}, and a {KINDS[group]} is found by one name: give the entry point "
+            "(pyproject.toml) the same, and install it again"
+        )
+
+
 def _known(name: str, group: str) -> EntryPoint:
     points = list_entry_points(group)
     if name not in points:
@@ -464,7 +499,7 @@ def plugin_code(spec: str, *groups: str, tools: Collection[str] = (), always: Co
     module, name = code_of(spec, *groups)
     own = _own_files(spec, module, name, import_paths(spec))
     rooms = sorted({*always, *_rooms(own.values(), tools)})
-    used = {f"{_OURS}:{_shown(path)}": path for room in rooms for path in _room_files(room)}
+    used = {f"{_OURS}:{path.relative_to(_PACKAGE).as_posix()}": path for room in rooms for path in _room_files(room)}
     return digest_of(own | used)
 
 
@@ -744,7 +779,3 @@ def _room_files(room: str) -> list[Path]:
     place: Any = _PACKAGE.joinpath(*room.split("."))
     files = place.rglob("*.py") if place.is_dir() else (place.with_suffix(end) for end in (_PYTHON, ".toml"))
     return sorted(path for path in files if path.is_file())
-
-
-def _shown(path: Path) -> str:
-    return path.relative_to(_PACKAGE).as_posix()

@@ -80,7 +80,7 @@ def send(folder: str | Path, url: str) -> Moved:
         _check_apart(folder, system, root)
         system.invalidate_cache()
         known = _read_list(system, root, LIST, url) or _read_list(system, root, _SENDING, url) or _Sent()
-        sizes = {path.removeprefix(f"{root}/"): about["size"] for path, about in _found(system, root).items()}
+        sizes = {path.removeprefix(f"{root}/"): size for path, size in _sizes(system, root).items()}
         others = sorted(name for name in sizes if name not in records and name not in {LIST, _SENDING})
         others += sorted(name for name in records if name in sizes and name not in known.names)
         _check_same(known.content, content, shown(url), "another place, or empty that one")
@@ -265,11 +265,12 @@ def _place(url: str, root: str) -> str:
     return re.sub("/{2,}", "/", root).rstrip("/")
 
 
-def _found(system: "AbstractFileSystem", root: str) -> dict[str, Any]:
-    """Return all files below a place, with their sizes; a marker of a folder holds nothing, and is none."""
+def _sizes(system: "AbstractFileSystem", root: str) -> dict[str, int]:
+    """Return the bytes of all files below a place; a marker of a folder holds nothing, and is none."""
     found = dict(system.find(root, detail=True)) if system.exists(root) else {}
     # Ends of keys without bytes that consoles and Hadoop make for a folder
-    return {path: about for path, about in found.items() if about["size"] or not path.endswith(("/", "_$folder$"))}
+    sizes = {path: about["size"] for path, about in found.items()}
+    return {path: size for path, size in sizes.items() if size or not path.endswith(("/", "_$folder$"))}
 
 
 def _put(system: "AbstractFileSystem", path: Path, there: str) -> None:

@@ -5,7 +5,7 @@ import json
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from pydantic import Field
 
@@ -143,7 +143,7 @@ def write_drift_profile(profile: DriftProfile, path: Path) -> None:
         scratch.write_text("# SPDX-License-Identifier: Apache-2.0\n" + "\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _lines(values: Mapping[str, Any]) -> list[str]:
+def _lines(values: Mapping[str, object]) -> list[str]:
     """Return keys and values as TOML; JSON's texts and numbers are TOML's."""
     return [
         f"{key} = {json.dumps(float(f'{value:.{_DIGITS}g}') if isinstance(value, float) else value)}"

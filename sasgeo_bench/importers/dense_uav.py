@@ -33,17 +33,15 @@ def read_dense_uav(reader: FolderReader) -> Dataset:
     """Read the folder of DenseUAV; raise `DatasetError`, which names what is missing."""
     positions, notes = read_positions(reader)
     folders = [
-        LabelFolder(relative=f"test/{name}", role="query" if name.startswith("query") else "gallery", view=_view(name))
+        LabelFolder(
+            relative=f"test/{name}", role="query" if name.startswith("query") else "gallery", view=name.split("_")[1]
+        )
         for name in _TEST
     ]
     training = [LabelFolder(relative=f"train/{view}", role="train", view=view) for view in ("drone", "satellite")]
     folders += [folder for folder in training if reader.has(folder.relative)]
     items = [item for folder in folders for item in read_labels(reader, folder, digits=6)]
     return Dataset(card=CARD, items=tuple(_placed(item, positions) for item in items), notes=(*notes, *reader.notes()))
-
-
-def _view(name: str) -> str:
-    return name.split("_")[1]
 
 
 def _placed(item: Item, positions: dict[str, Position]) -> Item:

@@ -57,8 +57,26 @@ from sasgeo_bench.scoring.strata import GROUP, queries_of, steps_frame
 from sasgeo_bench.tasks.split import Split
 
 Draw = Callable[[Path], object]
-Named = Iterator[tuple[str, Draw]]
+Named = Iterator[tuple[tuple[str, ...], Draw]]  # parts of the name of a file, and what draws it
 MOST_STANFORD: Final = 5  # matchers
+FIGURES: Final = {  # kinds by how the names of their files begin, in the order in which a site shows them
+    "contrast": "registered contrasts, place by place",
+    "stress": "success under stress",
+    "age": "success against the age of the map",
+    "strength": "success against strength",
+    "distance": "error along the way",
+    "interval": "how far the odometer carries a fix",
+    "risk": "risk against coverage",
+    "reliability": "reliability",
+    "stanford": "protection levels against errors",
+    "ablation": "arms side by side",
+    "recall": "recall against K",
+    "errors": "the distribution of errors",
+    "price": "success against cost",
+    "cost": "the cost of decisions",
+    "drift": "success against the drift of odometers",
+}
+OTHERS: Final = ("ablation", "recall", "errors", "price", "cost", "drift")  # stand together on a site
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
 
 
@@ -78,57 +96,46 @@ def figures_extra(scored: Scored, *, contrasts: Sequence[Contrast] = (), split: 
     ages = ages_frame(steps, queries, scored.measured)
     # An age is no other strength: where maps have ages, those are the axis.
     others = steps[~steps["suite"].isin(set(ages["suite"]))]
-    calibrated = _calibrated(table)
+    chances = table[table["metric"] == "ece"]  # of the matchers x rejectors that give probabilities
+    calibrated = set(zip(chances["matcher"], chances["rejector"], strict=True))
     judged, groups = scored.judged, GROUP[1:]
 
-    def each(name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., object]) -> Named:
+    def each(rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., object]) -> Named:
         """Yield a figure for each group of rows; prior groups are never together."""
         for key, part in rows.groupby(list(columns), sort=True):
-            yield _file_name(name, *map(str, key)), partial(draw, rows=part, shown=shown)
+            yield tuple(map(str, key)), partial(draw, rows=part, shown=shown)
 
     kinds: dict[str, Callable[[], Named]] = {
-        "success against the age of the map": lambda: each("age", ages, GROUP, draw_ages),
-        "success against strength": lambda: each("strength", others, GROUP, draw_steps),
-        "success under stress": lambda: each("stress", stress_frame(table, shown), groups, draw_bars),
-        "arms side by side": lambda: each("ablation", ablation_frame(scores, contrasts, shown), groups, draw_ablation),
-        "differences by place": lambda: _forests(scored, contrasts),
-        "recall against K": lambda: each(
-            "recall", recall_frame(alone, scored.predictions, scored.truths, shown), groups, draw_recall
-        ),
-        "the distribution of errors": lambda: each("errors", errors_frame(alone, table, shown), groups, draw_errors),
-        "success against cost": lambda: each("price", _priced(scored), groups, draw_prices),
-        "risk against coverage": lambda: each("risk", risk_frame(judged, shown), GROUP, draw_risk),
-        "reliability": lambda: each(
-            "reliability", reliability_frame(judged, calibrated, shown), groups, draw_reliability
-        ),
-        "the cost of decisions": lambda: each("cost", cost_frame(judged, calibrated, shown), groups, draw_costs),
-        "protection levels against errors": lambda: _stanfords(scored, shown, split),
-        "error along flights": lambda: each(
-            "distance", distance_frame(scored.views, scores, shown), GROUP, draw_distance
-        ),
-        "how far odometers carry fixes on flights": lambda: each(
-            "interval", interval_frame(table, kinds_of(scores), shown), GROUP, draw_intervals
-        ),
-        "success against the drift of odometers": lambda: each("drift", drift_frame(table, shown), groups, draw_drift),
+        "contrast": lambda: _forests(scored, contrasts),
+        "stress": lambda: each(stress_frame(table, shown), groups, draw_bars),
+        "age": lambda: each(ages, GROUP, draw_ages),
+        "strength": lambda: each(others, GROUP, draw_steps),
+        "distance": lambda: each(distance_frame(scored.views, scores, shown), GROUP, draw_distance),
+        "interval": lambda: each(interval_frame(table, kinds_of(scores), shown), GROUP, draw_intervals),
+        "risk": lambda: each(risk_frame(judged, shown), GROUP, draw_risk),
+        "reliability": lambda: each(reliability_frame(judged, calibrated, shown), groups, draw_reliability),
+        "stanford": lambda: _stanfords(scored, shown, split),
+        "ablation": lambda: each(ablation_frame(scores, contrasts, shown), groups, draw_ablation),
+        "recall": lambda: each(recall_frame(alone, scored.predictions, scored.truths, shown), groups, draw_recall),
+        "errors": lambda: each(errors_frame(alone, table, shown), groups, draw_errors),
+        "price": lambda: each(_priced(scored), groups, draw_prices),
+        "cost": lambda: each(cost_frame(judged, calibrated, shown), groups, draw_costs),
+        "drift": lambda: each(drift_frame(table, shown), groups, draw_drift),
     }
-    drawn: dict[str, dict[str, Draw]] = {}
-    for kind, make in kinds.items():
-        with scored.failures.of(f"figures of {kind}"):
-            drawn[kind] = {f"{name}.svg": draw for name, draw in make()}
-    empty = [kind for kind, named in drawn.items() if not named]
+    drawn: dict[str, Draw] = {}
+    empty = []
+    for stem, what in FIGURES.items():
+        with scored.failures.of(f"figures of {what}"):
+            found = {_file_name(stem, *names): draw for names, draw in kinds[stem]()}
+            drawn |= found
+            empty += [] if found else [what]
     if empty:
-        tell(f"figures left out, for nothing on this board is seen in them: {', '.join(empty)}")
-    return Extra(figures={name: draw for named in drawn.values() for name, draw in named.items()})
+        tell(f"figures left out, for nothing on this board is seen in them: {'; '.join(empty)}")
+    return Extra(figures=drawn)
 
 
 def _file_name(*parts: str) -> str:
-    return _PLAIN.sub("-", "-".join(parts)).strip("-").lower()
-
-
-def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
-    """Return the matchers x rejectors that give probabilities."""
-    rows = table[table["metric"] == "ece"]
-    return set(zip(rows["matcher"], rows["rejector"], strict=True))
+    return f"{_PLAIN.sub('-', '-'.join(parts)).strip('-').lower()}.svg"
 
 
 def _priced(scored: Scored) -> pd.DataFrame:
@@ -142,10 +149,7 @@ def _forests(scored: Scored, contrasts: Sequence[Contrast]) -> Named:
     for contrast, finding in zip(contrasts, scored.board.findings, strict=True):
         places = by_place(contrast, scored.scores, scored.judged) if finding.n else ()
         if places:
-            yield (
-                _file_name("contrast", contrast.name),
-                partial(draw_forest, contrast=contrast, finding=finding, places=places),
-            )
+            yield (contrast.name,), partial(draw_forest, contrast=contrast, finding=finding, places=places)
 
 
 def _stanfords(scored: Scored, shown: Sequence[str], split: Split | None) -> Named:
@@ -158,7 +162,4 @@ def _stanfords(scored: Scored, shown: Sequence[str], split: Split | None) -> Nam
             if len(item.level_m) and len(rows) <= MOST_STANFORD:
                 found.setdefault(key, {})[matcher, item.method] = item
     for (prior_group, risk), levels in sorted(found.items()):
-        yield (
-            _file_name("stanford", f"{risk:g}", prior_group),
-            partial(draw_stanford, levels=levels, limit_m=FIX_M),
-        )
+        yield (f"{risk:g}", prior_group), partial(draw_stanford, levels=levels, limit_m=FIX_M)

@@ -135,13 +135,11 @@ def pictures_extra(
         f"{len(rows)} of {kind}" for kind, rows in found.listed.items() if rows or kind not in _SOMETIMES
     )
     tell(f"pictures: {listed}, {sum(map(len, found.files.values())) / 1e6:.2f} MB")
-    return Extra(tables=answers, pictures=_with_list(found.files, found.listed) if found.files else {})
-
-
-def _with_list(files: Mapping[str, bytes], listed: Mapping[str, Sequence[Picture]]) -> dict[str, bytes]:
-    kinds = {kind: [item.model_dump(mode="json") for item in items] for kind, items in listed.items()}
-    content = {**kinds, "licence": LICENCE, "attribution": ATTRIBUTION}
-    return {**files, PICTURES_FILE: json_text(content).encode()}
+    if not found.files:
+        return Extra(tables=answers)
+    kinds = {kind: [item.model_dump(mode="json") for item in items] for kind, items in found.listed.items()}
+    content = json_text({**kinds, "licence": LICENCE, "attribution": ATTRIBUTION})
+    return Extra(tables=answers, pictures={**found.files, PICTURES_FILE: content.encode()})
 
 
 def _there(about: TaskManifest, root: Path) -> Task | None:

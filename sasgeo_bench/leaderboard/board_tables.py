@@ -3,28 +3,31 @@
 
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.manifests import BoardEntry
-from sasgeo_bench.leaderboard.private_board import SEEDS_NOTE
+from sasgeo_bench.leaderboard.manifests import BoardEntry, MetricRecord, SeedFigure
 from sasgeo_bench.leaderboard.tables import (
     FEW,
     Cell,
     Column,
+    Field,
     Key,
     Mark,
     Record,
     Row,
+    Shown,
     Table,
     Tie,
     column,
     figure_cell,
     file_stem,
+    grid_of,
     interval_text,
     marks_of,
     number_cell,
@@ -39,10 +42,10 @@ from sasgeo_bench.leaderboard.tables import (
     sort_key,
     suite_card,
     suite_words,
+    table_of,
     tally_text,
-    text_cells,
     ties_of,
-    words,
+    word,
 )
 from sasgeo_bench.scoring.compare import LEAST_PLACES, Finding
 from sasgeo_bench.scoring.contrasts import AREAS
@@ -51,6 +54,7 @@ from sasgeo_bench.scoring.decisions import PRESENT_SHARES
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, mixture_name
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
+from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, MOST_STEPS, STRESS, is_bin, is_step
 from sasgeo_bench.scoring.tables import AS_USED, SCENES
 from sasgeo_bench.tasks.query import BY, SEQUENCE
@@ -77,9 +81,9 @@ MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1
 class Book:
     """Figures of a board that take every answer, by entry and queries; and the names of the pages that show them.
 
-    `controls` are the entries that are never ranked. `counted` names the kinds and steps of stress that the
-    first figure of a table counts, `lost` the entries without a sound answer, and how often; both are empty without
-    scored queries.
+    `controls` are the entries that are never ranked, `metrics` those of other packages by name. `counted` names the
+    kinds and steps of stress that the first figure of a table counts, `lost` the entries without a sound answer, and
+    how often; both are empty without scored queries.
     """
 
     figures: Mapping[tuple[str, ...], Record]
@@ -91,10 +95,18 @@ class Book:
     suite_pages: Mapping[str, str]
     counted: Mapping[Key, str]
     lost: Mapping[Key, str]
+    metrics: Mapping[str, MetricRecord] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, board: pd.DataFrame, listed: Sequence[BoardEntry] = (), scores: pd.DataFrame | None = None) -> Self:
-        """Index a leaderboard with its entries, which may be listed, and its scored queries."""
+    def of(
+        cls,
+        board: pd.DataFrame,
+        listed: Sequence[BoardEntry] = (),
+        scores: pd.DataFrame | None = None,
+        *,
+        metrics: Sequence[MetricRecord] = (),
+    ) -> Self:
+        """Index a leaderboard with its entries, which may be listed, its scored queries and metrics of others."""
         entries = {entry.name: entry for entry in listed}
         for row in records_of(board.drop_duplicates("matcher")) if "set_apart" in board else ():
             reason: str | None = None if pd.isna(row["set_apart"]) else row["set_apart"]
@@ -121,7 +133,8 @@ class Book:
             matcher_pages=page_names("matcher", names),
             suite_pages=page_names("suite", [suite for suite, _, _ in sorted(matchers)]),
             counted={key: _counted(rows) for key, rows in _by_group(scored)},
-            lost={key: _lost(rows) for key, rows in _by_group(scored)},
+            lost={key: ", ".join(_lost(rows)) for key, rows in _by_group(scored)},
+            metrics={one.name: one for one in metrics},
         )
 
     def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
@@ -131,6 +144,19 @@ class Book:
     def main(self, key: Key, matcher: str, metric: str) -> Record | None:
         """Return the figure under stress, or of all queries where nothing is stressed."""
         return self.pick(key, matcher, metric, STRESS) or self.pick(key, matcher, metric)
+
+    def besides(self, track: str) -> tuple[str, ...]:
+        """Return the figures that a table shows beside the primary one, of the same queries."""
+        own = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
+        return (*own, *(name for name, one in self.metrics.items() if track in one.tracks))
+
+    def column(self, term: str, *, order: str = "none") -> Column:
+        """Return the column of a term, which may be a metric of another package."""
+        metric, plain = self.metrics.get(term), column(term, order=order)
+        if metric is None:
+            return plain
+        unit = "" if metric.unit == "1" else f" ({metric.unit})"
+        return replace(plain, name=f"{term}{unit}", meaning=metric.to_text())
 
     def name_cell(self, matcher: str) -> Cell:
         """Return the name of a matcher with its marks and a link to its page."""
@@ -173,34 +199,27 @@ def _counted(rows: pd.DataFrame) -> str:
     return "; ".join(texts) + (f" ({', '.join(units)})" if units else "")
 
 
-def _lost(rows: pd.DataFrame) -> str:
-    counts = rows.loc[~rows["status"].isin(_SOUND), ["matcher", "status"]].value_counts(sort=False).sort_index()
-    named = (f"{key[0]} {count} ({key[1]})" for key, count in counts.items() if isinstance(key, tuple))
-    return ", ".join(named)
+def _lost(rows: pd.DataFrame) -> list[str]:
+    lost = rows[~rows["status"].isin(_SOUND)]
+    counts = Counter(zip(lost["matcher"], lost["status"], strict=True))
+    return [f"{matcher} {count} ({status})" for (matcher, status), count in sorted(counts.items())]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Section:
-    """One suite, track and prior group: its table, and that of contestants that are set apart, if any."""
+    """One suite, track and prior group: its table, and that of contestants that are set apart, if any.
+
+    `context` says which queries the table counts, and the success on them without a method.
+    """
 
     suite: str
     track: str
     prior_group: str
     prior: str
     suite_page: str
-    counted: str
-    for_nothing: str
-    attainable: str
+    context: str
     table: Table
     apart: Table | None = None
-
-    @property
-    def context(self) -> str:
-        """Return which queries the table counts, and the success on them without a method."""
-        texts = [f"Stress that is counted: {self.counted}."] if self.counted else []
-        texts += [f"Without looking at the view: {self.for_nothing}."] if self.for_nothing else []
-        texts += [f"Attainable: {self.attainable}."] if self.attainable else []
-        return " ".join(texts)
 
 
 def sections_of(book: Book) -> tuple[Section, ...]:
@@ -214,29 +233,38 @@ def _section(book: Book, key: Key) -> Section:
     names = book.matchers[key]
     apart = [name for name in names if book.is_set_apart(name)]
     table = suite_table(book, key, [name for name in names if name not in apart])
-    unasked = [name for name in book.entries if name not in names]
-    lost = book.lost.get(key, "")
-    lines = [*table.notes, *([f"Without a sound answer, which is a miss: {lost}."] if lost else [])]
-    lines += [f"Not asked here: {', '.join(unasked)}."] if unasked else []
+    beside = {
+        "Without a sound answer, which is a miss": book.lost.get(key, ""),
+        "Not asked here": ", ".join(name for name in book.entries if name not in names),
+    }
+    context = {
+        "Stress that is counted": book.counted.get(key, ""),
+        "Without looking at the view": _for_nothing(book, key),
+        "Attainable": _attainable(book, key),
+    }
+    set_apart = replace(
+        suite_table(book, key, apart),
+        name=f"{table.name}-apart",
+        title=f"Set apart, not to be compared with those above: {suite}, {track}",
+        notes=tuple(f"{name}: {book.entries[name].set_apart}." for name in apart),
+    )
     return Section(
         suite=suite,
         track=track,
         prior_group=prior_group,
         prior=prior_words(prior_group),
         suite_page=book.suite_pages[suite],
-        counted=book.counted.get(key, ""),
-        for_nothing=_for_nothing(book, key),
-        attainable=_attainable(book, key),
-        table=replace(table, notes=tuple(lines)),
-        apart=_apart(book, key, apart) if apart else None,
+        context=" ".join(f"{what}: {text}." for what, text in context.items() if text),
+        table=replace(table, notes=(*table.notes, *(f"{what}: {text}." for what, text in beside.items() if text))),
+        apart=set_apart if apart else None,
     )
 
 
-def _apart(book: Book, key: Key, names: Sequence[str]) -> Table:
-    table = suite_table(book, key, names)
-    reasons = tuple(f"{name}: {book.entries[name].set_apart}." for name in names)
-    title = f"Set apart, not to be compared with those above: {key[0]}, {key[1]}"
-    return replace(table, name=f"{table.name}-apart", title=title, notes=reasons)
+def suite_tables(book: Book) -> Iterator[Table]:
+    """Yield the tables of `sections_of` as they stand alone, each with what it counts, and those set apart."""
+    for section in sections_of(book):
+        yield replace(section.table, notes=(*filter(None, (section.context,)), *section.table.notes))
+        yield from filter(None, (section.apart,))
 
 
 def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
@@ -247,28 +275,42 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     suite, track, prior_group = key
     primary = primary_of(track).name
     found = {name: row for name in names if (row := book.main(key, name, primary)) is not None}
-    order = sorted(found, key=lambda name: (-_value(found[name]), name))
     ties = ties_of(list(found.values()))
     tie_of = {name: number for number, tie in enumerate(ties) for name in tie.names}
     ranked = sum(not pd.isna(row["rank_best"]) for row in found.values())
-    rows = tuple(_row(book, key, found[name], tie_of.get(name), ranked) for name in order)
-    titles = (primary, "rank", *_besides(track), "control", "false fixes", "detectable", "n", "missing", "blocks")
-    table = Table(
-        name=file_stem("board", suite, track, prior_group),
-        title=f"{suite}: {track}, {prior_words(prior_group)}",
-        columns=(
-            column("matcher", is_number=False),
-            *(column(name, order="descending" if name == primary else "none") for name in titles),
-        ),
-        rows=rows,
-        notes=_notes(book, ties, found, ranked),
+    tone = {name: "tied" if number % 2 == 0 else "other-tie" for name, number in tie_of.items()}
+    tone |= dict.fromkeys(book.controls, "control")
+    shares = Mark(text="tie", meaning="shares ranks with others, named below the table")
+    beside = book.besides(track)
+
+    def _figure(metric: str, stratum: str = "") -> Callable[[Record], Cell]:
+        return lambda row: figure_cell(book.pick(key, row["matcher"], metric, stratum or row["stratum"]))
+
+    fields: tuple[Field[Record], ...] = (
+        (word("matcher"), lambda row: book.name_cell(row["matcher"])),
+        (column(primary, order="descending"), lambda row: figure_cell(row, has_bar=True)),
+        (column("rank"), lambda row: rank_cell(row, ranked=ranked, mark=shares if row["matcher"] in tie_of else None)),
+        *((book.column(metric), _figure(metric)) for metric in beside),
+        (column("control"), _figure(primary, CONTROL)),
+        (column("false fixes"), _figure(FALSE_ABSENT.name, ALL)),
+        (column("detectable"), lambda row: float(row["detectable"])),
+        (column("n"), lambda row: int(row["n"])),
+        (column("missing"), lambda row: int(row["missing"]) or Cell(text="-", key=0.0)),
+        (column("blocks"), _blocks_cell),
     )
-    return table.without_empty(*_besides(track), "false fixes", "control", "detectable", "missing")
+    table = table_of(
+        file_stem("board", suite, track, prior_group),
+        f"{suite}: {track}, {prior_words(prior_group)}",
+        sorted(found.values(), key=lambda row: (-_value(row), row["matcher"])),
+        fields,
+        notes=_notes(book, ties, found, ranked),
+        tone=lambda row: tone.get(row["matcher"], "plain"),
+    )
+    return table.without_empty(*beside, "false fixes", "control", "detectable", "missing")
 
 
-def _besides(track: str) -> tuple[str, ...]:
-    """Return the figures that a table shows beside the primary one, of the same queries."""
-    return _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
+def _blocks_cell(row: Record) -> Cell:
+    return Cell(text=f"{row['blocks']} in {counted(int(row['places']), 'place')}", key=float(row["blocks"]))
 
 
 def _value(row: Record) -> float:
@@ -276,27 +318,8 @@ def _value(row: Record) -> float:
     return -math.inf if math.isnan(value) else value
 
 
-def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Row:
-    name, stratum = str(main["matcher"]), str(main["stratum"])
-    primary = str(main["metric"])
-    mark = None if tie is None else Mark(text="tie", meaning="shares ranks with others, named below the table")
-    tone = "control" if name in book.controls else "plain" if tie is None else ("tied" if tie % 2 == 0 else "other-tie")
-    places = counted(int(main["places"]), "place")
-    return Row(
-        cells=(
-            book.name_cell(name),
-            figure_cell(main, has_bar=True),
-            rank_cell(main, ranked=ranked, mark=mark),
-            *(figure_cell(book.pick(key, name, metric, stratum)) for metric in _besides(key[1])),
-            figure_cell(book.pick(key, name, primary, CONTROL)),
-            figure_cell(book.pick(key, name, FALSE_ABSENT.name)),
-            number_cell(float(main["detectable"])),
-            plain_cell(int(main["n"])),
-            plain_cell(int(main["missing"])) if main["missing"] else Cell(text="-", key=0.0),
-            Cell(text=f"{main['blocks']} in {places}", key=float(main["blocks"])),
-        ),
-        tone=tone,
-    )
+def _value_of(row: Record | None) -> float:
+    return math.nan if row is None else float(row["value"])
 
 
 def _notes(book: Book, ties: Sequence[Tie], found: Mapping[str, Record], ranked: int) -> tuple[str, ...]:
@@ -344,34 +367,26 @@ def _attainable(book: Book, key: Key) -> str:
 
 def strata_tables(book: Book, key: Key) -> Iterator[Table]:
     """Yield the primary figure of each part of a suite, a matcher a column, in tables that a screen holds."""
-    names = book.matchers[key]
-    for first in range(0, len(names), MOST_COLUMNS):
-        yield _strata_table(book, key, names[first : first + MOST_COLUMNS], number=first // MOST_COLUMNS + 1)
-
-
-def _strata_table(book: Book, key: Key, names: Sequence[str], *, number: int) -> Table:
     suite, track, prior_group = key
     primary = primary_of(track).name
-    more = "" if number == 1 else f", table {number}"
-    rows = []
-    for stratum in book.strata[key]:
-        found = {name: book.pick(key, name, primary, stratum) for name in names}
-        counts = sorted({int(row["n"]) for row in found.values() if row is not None})
-        if counts:
-            first = Cell(text=stratum)
-            n = Cell(text="-".join(map(str, counts)), key=float(counts[0]))
-            most = book.pick(key, names[0], CEILING.name, stratum)
-            ceiling = number_cell(math.nan if most is None else float(most["value"]))
-            rows.append(Row(cells=(first, n, ceiling, *(figure_cell(row) for row in found.values()))))
-    meaning = column(primary).meaning
-    columns = [column(primary, title=name) for name in names]
-    return Table(
-        name=file_stem("strata", suite, track, prior_group, "" if number == 1 else str(number)),
-        title=f"{primary} by stratum: {track}, {prior_words(prior_group)}{more}",
-        columns=(column("part", is_number=False), column("n"), column(CEILING.name), *columns),
-        rows=tuple(rows),
-        notes=(f"Cells: {primary} with its 95 % interval. {meaning}.",),
-    )
+    for number, first in enumerate(range(0, len(book.matchers[key]), MOST_COLUMNS), start=1):
+        names = book.matchers[key][first : first + MOST_COLUMNS]
+        lines: list[Sequence[Shown]] = []
+        for part in book.strata[key]:
+            rows = [book.pick(key, name, primary, part) for name in names]
+            counts = sorted({int(row["n"]) for row in rows if row is not None})
+            if counts:
+                n = Cell(text="-".join(map(str, counts)), key=float(counts[0]))
+                ceiling = _value_of(book.pick(key, names[0], CEILING.name, part))
+                lines.append((part, n, ceiling, *map(figure_cell, rows)))
+        more = ("", "") if number == 1 else (str(number), f", table {number}")
+        yield grid_of(
+            file_stem("strata", suite, track, prior_group, more[0]),
+            f"{primary} by stratum: {track}, {prior_words(prior_group)}{more[1]}",
+            (word("part"), column("n"), column(CEILING.name), *(column(primary, title=name) for name in names)),
+            lines,
+            notes=[f"Cells: {primary} with its 95 % interval. {column(primary).meaning}."],
+        )
 
 
 def cost_table(book: Book) -> Table:
@@ -381,16 +396,15 @@ def cost_table(book: Book) -> Table:
     by_kind = {(key[3], key[-1], key[1]): row for key, row in found.items()}
     units = {key[-1]: str(row["unit"]) for key, row in found.items()}
     values = {
-        name: [_cost(by_kind.get((name, metric, track))) for _, metric, track in kinds]
+        name: [_value_of(by_kind.get((name, metric, track))) for _, metric, track in kinds]
         for name in sorted({key[3] for key in found})
     }
     order = sorted(values, key=lambda name: [(math.isnan(value), value) for value in values[name][:1]])
-    rows = [Row(cells=(book.name_cell(name), *map(number_cell, values[name]))) for name in order]
     columns = [
         column(
             metric,
             title=f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})",
-            order="ascending" if at == 0 else "none",
+            order="none" if at else "ascending",
         )
         for at, (_, metric, track) in enumerate(kinds)
     ]
@@ -398,12 +412,8 @@ def cost_table(book: Book) -> Table:
         "Measured once, on the machine that made the board; 1 kB is 1000 bytes, 1 MB a million.",
         "Each was measured on the queries that it was asked: those of other suites do not compare.",
     )
-    first = column("matcher", is_number=False)
-    return Table(name="costs", title="What answers cost", columns=(first, *columns), rows=tuple(rows), notes=notes)
-
-
-def _cost(row: Record | None) -> float:
-    return math.nan if row is None else float(row["value"])
+    lines: list[tuple[Shown, ...]] = [(book.name_cell(name), *values[name]) for name in order]
+    return grid_of("costs", "What answers cost", (word("matcher"), *columns), lines, notes=notes)
 
 
 def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None) -> Iterator[Table]:
@@ -412,7 +422,7 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
     `steps` is from `strata.steps_frame`; `ages`, from `plots.age_names`, names steps that are ages of a map.
     """
     named = ages or {}
-    for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
+    for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True) if len(steps) else ():
         suite, track, prior_group, kind, unit = map(str, key)
         records = records_of(part)
         counts: dict[tuple[int, float], int] = {}
@@ -421,40 +431,33 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
             counts[step] = max(counts.get(step, 0), int(row["n"]))
         order = part.groupby("matcher")["value"].mean().sort_index().sort_values(ascending=False, kind="stable")
         by_step = {(row["matcher"], row["view_cells"], row["strength"]): row for row in records}
-        rows = tuple(
-            Row(cells=(Cell(text=str(name)), *(figure_cell(by_step.get((name, *step))) for step in counts)))
-            for name in order.index
-        )
         titles = [
             f"{named.get((suite, track, prior_group, strength, size), f'{strength:g}')}, {size} cells, n = {n}"
             for (size, strength), n in counts.items()
         ]
-        primary = primary_of(track).name
-        yield Table(
-            name=file_stem("steps", suite, track, prior_group, kind),
-            title=f"{suite}: {track}, {prior_words(prior_group)}, step by step: {kind} ({unit})",
-            columns=(*words("matcher"), *(column(primary, title=title) for title in titles)),
-            rows=rows,
+        yield grid_of(
+            file_stem("steps", suite, track, prior_group, kind),
+            f"{suite}: {track}, {prior_words(prior_group)}, step by step: {kind} ({unit})",
+            (word("matcher"), *(column(primary_of(track).name, title=title) for title in titles)),
+            [(name, *(figure_cell(by_step.get((name, *step))) for step in counts)) for name in order.index],
         )
 
 
 AT_MOST: Final = "at most"  # the line of the ceiling
 
 
-def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
-    """Yield who is good at what, of some suites or of all: a matcher a line, a suite a column, figure and rank.
+def summary(book: Book) -> Iterator[Table]:
+    """Yield who is good at what: a matcher a line, a suite a column, figure and rank.
 
     Columns of false fixes at absent places follow those of the suites. The first lines say of each suite how many
     queries count, what can be reached and what guessing and the controls reach. Suites with more ranked matchers come
     first, so do matchers that were asked about more of them. A cell leads where its rank may be the first of several.
     """
-    keys = [key for key in book.matchers if not suites or key[0] in suites]
-    for group in sorted({key[1:] for key in keys}):
-        yield _overview(book, [key for key in keys if key[1:] == group])
+    for group in sorted({key[1:] for key in book.matchers}):
+        yield _overview(book, [key for key in book.matchers if key[1:] == group])
 
 
 def _overview(book: Book, keys: Sequence[Key]) -> Table:
-    """Return the table of the suites of one track and prior group."""
     track, prior_group = keys[0][1:]
     primary = primary_of(track).name
     names = sorted({name for key in keys for name in book.matchers[key]})
@@ -463,13 +466,17 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
     shown = sorted((key for key in keys if any(by_suite[key].values())), key=lambda key: (-ranked[key], key))
     absent = [key for key in shown if any(book.pick(key, name, FALSE_ABSENT.name) for name in names)]
     found = {name: [by_suite[key][name] for key in shown] for name in names}
-    order = _order(book, found)
+    means = {name: _mean_value(rows) for name, rows in found.items()}
+    order = sorted(  # controls, then matchers: who was asked about more suites first, then who is better on them
+        (name for name, rows in found.items() if any(row is not None for row in rows)),
+        key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
+    )
     whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
     weighed = [at for at, key in enumerate(shown) if ranked[key]]  # the others have too few places
     has_mean = len(weighed) > 1 and len(whole - book.controls) > 1
     rows = _overview_heads(book, shown, absent, primary, has_mean=has_mean)
     for name in order:
-        cells = [short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
+        cells = [short_cell(by_suite[key][name], is_rivalled=ranked[key] > 1) for key in shown]
         cells += [short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False) for key in absent]
         if has_mean:
             cells.append(number_cell(_mean_value([found[name][at] for at in weighed]) if name in whole else math.nan))
@@ -483,18 +490,9 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
     return Table(
         name=file_stem("summary", track, prior_group),
         title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-        columns=(*words("matcher"), *columns),
+        columns=(word("matcher"), *columns),
         rows=tuple(rows),
         notes=tuple(_overview_notes(primary, rows, has_absent=bool(absent), has_several=len(shown) > 1)),
-    )
-
-
-def _order(book: Book, found: Mapping[str, Sequence[Record | None]]) -> list[str]:
-    """Return controls, then matchers: who was asked about more suites first, then who is better on them."""
-    means = {name: _mean_value(rows) for name, rows in found.items()}
-    return sorted(
-        (name for name, rows in found.items() if any(row is not None for row in rows)),
-        key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
     )
 
 
@@ -544,7 +542,7 @@ def _overview_heads(
     beside = {"queries": [plain_cell(_count(book, key, FALSE_ABSENT.name)) for key in absent]}
     for title, metric in ((AT_MOST, CEILING.name), ("chance", CHANCE.name)):
         rows = [next(filter(None, (book.main(key, name, metric) for name in book.matchers[key])), None) for key in keys]
-        lines[title] = [number_cell(math.nan if row is None else float(row["value"])) for row in rows]
+        lines[title] = [number_cell(_value_of(row)) for row in rows]
     nothing = [Cell(text="-")]
     return [
         Row(
@@ -602,120 +600,16 @@ SHOWN_RATIO: Final = 20.0  # of the costs of a false fix and of withholding a ri
 _MIXTURES: Final = (AS_DRAWN, *map(mixture_name, PRESENT_SHARES))
 
 
-def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
-    """Return matcher x rejector over all suites, a table for each track and prior group."""
-    found = _rejection_rows(board).groupby(["track", "prior_group"], sort=True)
-    return tuple(
-        _rejection_table(
-            part, file_stem("rejection", *map(str, key)), f"Rejection: {key[0]}, {prior_words(str(key[1]))}"
-        )
-        for key, part in found
-    )
+Pair = tuple[str, str]  # matcher and rejector
+Best = Mapping[Pair, Mapping[str, Record]]  # figures by metric
 
 
-def risk_tables(board: pd.DataFrame) -> tuple[Table, ...]:
-    """Return what ranked matchers answer where 5 % of the answers may be false, a table for each track and prior group.
-
-    A line is a matcher with the rejector that orders its answers best, by their area; `rejection_tables` have them all.
-    """
-    found = (_risk_table(best, *named) for best, _, *named in _groups(board, "risk"))
-    return tuple(table for table in found if table.rows)
-
-
-def risk_tables_by_suite(board: pd.DataFrame) -> tuple[Table, ...]:
-    """Return how many of the answers of `risk_tables` are false where more places are absent, and in each suite."""
-    found = (_risk_by_suite(best, part, *named) for best, part, *named in _groups(board, "risk-by-suite"))
-    return tuple(table for table in found if table.rows)
-
-
-Best = Mapping[tuple[str, str], Mapping[str, Record]]  # figures by matcher and rejector, then by metric
-
-
-def _groups(board: pd.DataFrame, stem: str) -> Iterator[tuple[Best, pd.DataFrame, str, str]]:
-    """Yield by track and prior group the best pairs, the rows of all, the name of a table, and what it is of."""
-    rows = board[(board["rejector"] != "") & ~board["matcher"].map(is_unranked).astype(bool)]
-    for (track, prior_group), part in rows.groupby(["track", "prior_group"], sort=True):
-        where = f"{track}, {prior_words(str(prior_group))}"
-        yield _best_pairs(_rejection_rows(part)), part, file_stem(stem, str(track), str(prior_group)), where
-
-
-def _best_pairs(part: pd.DataFrame) -> Best:
-    """Return the figures of each matcher with the rejector of the least area, in the order of that area."""
-    found = {(str(key[0]), str(key[1])): _by_metric(mine) for key, mine in part.groupby(["matcher", "rejector"])}
-    order = sorted((_area(by_name), key) for key, by_name in found.items())
-    best: dict[str, tuple[str, str]] = {}
-    for area, key in order:
-        if area < math.inf:
-            best.setdefault(key[0], key)
-    return {key: found[key] for key in best.values()}
-
-
-def _risk_table(best: Best, name: str, where: str) -> Table:
-    rows = [
-        Row(
-            cells=(
-                *text_cells(*key),
-                *(figure_cell(by_name.get(metric)) for metric in (COVERED, REACHED)),
-                Cell(text=_kept(by_name.get(REACHED))),
-                plain_cell(int(by_name["aurc"]["n"])),
-            )
-        )
-        for key, by_name in best.items()
-    ]
-    figures = (column(COVERED, title="answered"), column(REACHED, title="false of these"))
-    return Table(
-        name=name,
-        title=f"Answers where 5 % of them may be false fixes: {where}",
-        columns=(*words("matcher", "rejector"), *figures, *words("risk kept"), column("n")),
-        rows=tuple(rows),
-        notes=_RISK_NOTES,
-    )
-
-
-def _kept(row: Record | None) -> str:
-    """Return whether the interval of a reached risk shows that it was kept.
-
-    >>> [_kept({"lo": lo, "hi": hi}) for lo, hi in ((0.0, 0.04), (0.03, 0.07), (0.06, 0.2))], _kept(None)
-    (['yes', 'open', 'no'], '-')
-    """
-    if row is None or math.isnan(row["lo"]):
-        return "-"
-    if row["hi"] <= SHOWN_RISK:
-        return "yes"
-    return "no" if row["lo"] > SHOWN_RISK else "open"
-
-
-def _risk_by_suite(best: Best, part: pd.DataFrame, name: str, where: str) -> Table:
-    reached = part[part["metric"] == REACHED]
-    suites = sorted(set(reached["suite"]) - {ALL_SUITES})
-    shares = {mixture_name(share): f"{100 * (1 - share):.0f} % of places absent" for share in PRESENT_SHARES}
-    places = [(ALL_SUITES, mixture) for mixture in shares] + [(suite, AS_DRAWN) for suite in suites]
-    keys = zip(*(reached[field] for field in ("matcher", "rejector", "suite", "stratum")), strict=True)
-    by_key: dict[tuple[Any, ...], Any] = dict(zip(keys, reached.to_dict("records"), strict=True))
-    titles = [*(shares[mixture] for mixture in shares), *suites]
-    return Table(
-        name=name,
-        title=f"How many of these are false, by share of absent places and by suite: {where}",
-        columns=(*words("matcher", "rejector"), *(column(REACHED, title=title) for title in titles)),
-        rows=tuple(
-            Row(
-                cells=(*text_cells(*key), *(short_cell(by_key.get((*key, *place)), has_rank=False) for place in places))
-            )
-            for key in best
-        ),
-        notes=_BY_SUITE_NOTES,
-    )
-
-
-def _by_metric(part: pd.DataFrame) -> dict[str, Record]:
-    """Return the rows of one matcher and rejector by their metric."""
-    return {str(row["metric"]): row for row in records_of(part)}
-
-
-def _area(by_name: Mapping[str, Record]) -> float:
-    """Return the area that orders rejectors, infinite where there is none."""
-    area = by_name["aurc"]["value"] if "aurc" in by_name else math.nan
-    return math.inf if math.isnan(area) else float(area)
+def rejection_tables(board: pd.DataFrame) -> Iterator[Table]:
+    """Yield matcher x rejector over all suites, a table for each track and prior group."""
+    for key, part in _rejection_rows(board).groupby(["track", "prior_group"], sort=True):
+        track, prior_group = map(str, key)
+        title = f"Rejection: {track}, {prior_words(prior_group)}"
+        yield _rejection_table(part, file_stem("rejection", track, prior_group), title)
 
 
 def rejection_of(board: pd.DataFrame, matcher: str) -> Table | None:
@@ -734,84 +628,189 @@ def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: 
 
     `has_queries` adds a column of the track and prior group of each line.
     """
-    rows = []
-    for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
-        matcher, rejector, track, prior_group = map(str, key)
-        by_name = _by_metric(mine)
-        queries = text_cells(f"{track}, {prior_group}") if has_queries else ()
-        figures = [figure_cell(by_name.get(metric)) for metric in _REJECTION]
-        cells = (*text_cells(matcher, rejector), *queries, *figures, plain_cell(int(mine["n"].iloc[0])))
-        is_control = is_unranked(matcher)
-        row = Row(cells=cells, tone="control" if is_control else "plain")
-        rows.append((is_control, _area(by_name), matcher, rejector, row))
-    rows.sort(key=lambda row: row[:4])
-    return Table(
-        name=name,
-        title=title,
-        columns=(
-            *words("matcher", "rejector"),
-            *(words("queries") if has_queries else ()),
-            *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")),
-        ),
-        rows=tuple(row for *_, row in rows),
+    found = {
+        tuple(map(str, key)): _by_metric(mine)
+        for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True)
+    }
+    is_control = {key: is_unranked(key[0]) for key in found}
+    order = sorted(found, key=lambda key: (is_control[key], _area(found[key]), key))
+    columns = [column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")]
+    lines: list[tuple[Shown, ...]] = [
+        (
+            *key[:2],
+            *([f"{key[2]}, {key[3]}"] if has_queries else []),
+            *(figure_cell(found[key].get(metric)) for metric in _REJECTION),
+            int(next(iter(found[key].values()))["n"]),
+        )
+        for key in order
+    ]
+    return grid_of(
+        name,
+        title,
+        (word("matcher"), word("rejector"), *([word("queries")] if has_queries else []), *columns),
+        lines,
         notes=("ECE and costs have no interval on this board: they decide nothing.",),
+        tones=["control" if is_control[key] else "plain" for key in order],
     )
 
 
-def acceptance_tables(acceptance: pd.DataFrame) -> tuple[Table, ...]:
-    """Return risk and coverage by the kind of absence, a table for each track and prior group; none without any.
+def _by_metric(part: pd.DataFrame) -> dict[str, Record]:
+    return {str(row["metric"]): row for row in records_of(part)}
+
+
+def _area(by_name: Mapping[str, Record]) -> float:
+    """Return the area that orders rejectors, infinite where there is none."""
+    area = by_name["aurc"]["value"] if "aurc" in by_name else math.nan
+    return math.inf if math.isnan(area) else float(area)
+
+
+def risk_tables(board: pd.DataFrame) -> Iterator[Table]:
+    """Yield what ranked matchers answer where 5 % of the answers may be false, a table for each track and prior group.
+
+    A line is a matcher with the rejector that orders its answers best, by their area; `rejection_tables` have them all.
+    """
+    answered, reached = column(COVERED, title="answered"), column(REACHED, title="false of these")
+    for best, _, track, prior_group in _best_pairs(board):
+        yield grid_of(
+            file_stem("risk", track, prior_group),
+            f"Answers where 5 % of them may be false fixes: {track}, {prior_words(prior_group)}",
+            (word("matcher"), word("rejector"), answered, reached, word("risk kept"), column("n")),
+            [
+                (
+                    *pair,
+                    figure_cell(by_name.get(COVERED)),
+                    figure_cell(by_name.get(REACHED)),
+                    _kept(by_name.get(REACHED)),
+                    int(by_name["aurc"]["n"]),
+                )
+                for pair, by_name in best.items()
+            ],
+            notes=_RISK_NOTES,
+        )
+
+
+def risk_tables_by_suite(board: pd.DataFrame) -> Iterator[Table]:
+    """Yield how many of the answers of `risk_tables` are false where more places are absent, and in each suite."""
+    shares = {mixture_name(share): f"{100 * (1 - share):.0f} % of places absent" for share in PRESENT_SHARES}
+    for best, part, track, prior_group in _best_pairs(board):
+        reached = part[part["metric"] == REACHED]
+        suites = sorted(set(reached["suite"]) - {ALL_SUITES})
+        places = [(ALL_SUITES, mixture) for mixture in shares] + [(suite, AS_DRAWN) for suite in suites]
+        keys = zip(*(reached[field] for field in ("matcher", "rejector", "suite", "stratum")), strict=True)
+        by_key: dict[tuple[str, ...], Record] = dict(zip(keys, records_of(reached), strict=True))
+        titles = (*shares.values(), *suites)
+        where = f"{track}, {prior_words(prior_group)}"
+        yield grid_of(
+            file_stem("risk-by-suite", track, prior_group),
+            f"How many of these are false, by share of absent places and by suite: {where}",
+            (word("matcher"), word("rejector"), *(column(REACHED, title=title) for title in titles)),
+            [(*pair, *(short_cell(by_key.get((*pair, *place)), has_rank=False) for place in places)) for pair in best],
+            notes=_BY_SUITE_NOTES,
+        )
+
+
+def _best_pairs(board: pd.DataFrame) -> Iterator[tuple[Best, pd.DataFrame, str, str]]:
+    """Yield the matchers, each with the rejector of the least area, by that area, of a track and prior group.
+
+    With them come the rows of all, track and prior group; without a matcher that has an area there is nothing.
+    """
+    rows = board[(board["rejector"] != "") & ~board["matcher"].map(is_unranked).astype(bool)]
+    for (track, prior_group), part in rows.groupby(["track", "prior_group"], sort=True):
+        pairs = _rejection_rows(part).groupby(["matcher", "rejector"])
+        found = {(str(key[0]), str(key[1])): _by_metric(mine) for key, mine in pairs}
+        best: dict[str, Pair] = {}
+        for area, key in sorted((_area(by_name), key) for key, by_name in found.items()):
+            if area < math.inf:
+                best.setdefault(key[0], key)
+        if best:
+            yield {key: found[key] for key in best.values()}, part, str(track), str(prior_group)
+
+
+def _kept(row: Record | None) -> str:
+    """Return whether the interval of a reached risk shows that it was kept.
+
+    >>> [_kept({"lo": lo, "hi": hi}) for lo, hi in ((0.0, 0.04), (0.03, 0.07), (0.06, 0.2))], _kept(None)
+    (['yes', 'open', 'no'], '-')
+    """
+    if row is None or math.isnan(row["lo"]):
+        return "-"
+    if row["hi"] <= SHOWN_RISK:
+        return "yes"
+    return "no" if row["lo"] > SHOWN_RISK else "open"
+
+
+def acceptance_tables(acceptance: pd.DataFrame) -> Iterator[Table]:
+    """Yield risk and coverage by the kind of absence, a table for each track and prior group, the least risk first.
 
     `acceptance` is from `rejection.acceptance_frame`. One cost ratio is shown, and no controls.
     """
     if not len(acceptance):
-        return ()
+        return
     shown = acceptance[(acceptance["cost_ratio"] == SHOWN_RATIO) & ~acceptance["matcher"].map(is_unranked).astype(bool)]
-    return tuple(
-        _acceptance_table(part, str(track), str(prior_group))
-        for (track, prior_group), part in shown.groupby(["track", "prior_group"], sort=True)
-    )
-
-
-def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
-    """Return risk and coverage, who has the least risk over all absences first, and an absence a line."""
-    rows: dict[tuple[str, ...], Row] = {}
-    risks: dict[tuple[str, ...], float] = {}
-    for names, mine in part.groupby(["matcher", "rejector", "absence"], sort=True):
-        key = tuple(map(str, names))
-        by_mixture = {str(row["mixture"]): row for row in records_of(mine)}
-        some = next(iter(by_mixture.values()))
-        absent = plain_cell(int(some["absent"]))
-        cells = [_cell(by_mixture.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")]
-        rows[key] = Row(cells=(*text_cells(*key), absent, *cells))
-        if AS_DRAWN in by_mixture and not math.isnan(by_mixture[AS_DRAWN]["risk"]):
-            risks[key] = float(by_mixture[AS_DRAWN]["risk"])
-    order = sorted(rows, key=lambda key: (risks.get((*key[:2], "all"), math.inf), key))
-    titles = [
-        (term, f"{term.split()[0]}, {mixture if mixture == AS_DRAWN else f'{100 * (1 - share):.0f} % absent'}")
-        for mixture, share in zip(_MIXTURES, (math.nan, *PRESENT_SHARES), strict=True)
-        for term in ("risk of fixes", "coverage")
+    shares = (AS_DRAWN, *(f"{100 * (1 - share):.0f} % absent" for share in PRESENT_SHARES))
+    columns = [
+        column(term, title=f"{term.split()[0]}, {share}") for share in shares for term in ("risk of fixes", "coverage")
     ]
-    return Table(
-        name=file_stem("acceptance", track, prior_group),
-        title=f"Risk and coverage by kind of absence: {track}, {prior_words(prior_group)}",
-        columns=(
-            *words("matcher", "rejector", "absence"),
-            column("absent"),
-            *(column(term, title=title) for term, title in titles),
-        ),
-        rows=tuple(rows[key] for key in order),
-        notes=(f"Fixes accepted by Eq. 14 at costs of {SHOWN_RATIO:g} to 1; acceptance.parquet holds other costs.",),
-    )
+    for (track, prior_group), part in shown.groupby(["track", "prior_group"], sort=True):
+        found = {
+            tuple(map(str, key)): {str(row["mixture"]): row for row in records_of(mine)}
+            for key, mine in part.groupby(["matcher", "rejector", "absence"], sort=True)
+        }
+        risks = {key: float(rows[AS_DRAWN]["risk"]) for key, rows in found.items() if AS_DRAWN in rows}
+        whole = {key[:2]: risk for key, risk in risks.items() if key[2] == "all" and not math.isnan(risk)}
+        lines: list[tuple[Shown, ...]] = [
+            (
+                *key,
+                int(next(iter(rows.values()))["absent"]),
+                *(share_cell(rows.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")),
+            )
+            for key, rows in sorted(found.items(), key=lambda item: (whole.get(item[0][:2], math.inf), item[0]))
+        ]
+        yield grid_of(
+            file_stem("acceptance", str(track), str(prior_group)),
+            f"Risk and coverage by kind of absence: {track}, {prior_words(str(prior_group))}",
+            (word("matcher"), word("rejector"), word("absence"), column("absent"), *columns),
+            lines,
+            notes=(
+                f"Fixes accepted by Eq. 14 at costs of {SHOWN_RATIO:g} to 1; acceptance.parquet holds other costs.",
+            ),
+        )
 
 
-def _cell(row: Mapping[Any, Any] | None, name: str) -> Cell:
+def share_cell(row: Record | None, name: str) -> Cell:
+    """Return a cell of a share of a table whose ends have its name, as in `risk`, `risk_lo`, `risk_hi`."""
     if row is None:
         return figure_cell(None)
     value, lo, hi = (float(row[f"{name}{end}"]) for end in ("", "_lo", "_hi"))
     return figure_cell({"value": value, "lo": lo, "hi": hi, "unit": "1", "interval": "", "is_applicable": True})
 
 
-_Found = Mapping[str, Mapping[str, Record]]  # kind of place -> matcher -> row
+_AREAS: Final = ("available", "misleading", "hazardous", "exceeded")
+
+
+def protection_tables(protection: pd.DataFrame) -> Iterator[Table]:
+    """Yield the results of protection levels at one alert limit, a table for each prior group."""
+    limits = sorted(set(protection["alert_limit_m"])) if len(protection) else ()
+    shown_m = FIX_M if FIX_M in limits else next(iter(limits), FIX_M)
+    others = " and ".join(f"{limit:g}" for limit in limits if limit != shown_m)
+    columns = (word("matcher"), word("method"), column("risk", order="ascending"), *map(column, (*_AREAS, "n")))
+    shown = protection[protection["alert_limit_m"] == shown_m] if limits else protection
+    for prior_group, part in shown.groupby("prior_group", sort=True) if limits else ():
+        order = part.sort_values(["risk", "available", "matcher", "method"], ascending=[True, False, True, True])
+        yield grid_of(
+            file_stem("protection", str(prior_group)),
+            f"Alert limit {shown_m:g} m, {prior_words(str(prior_group))}",
+            (*columns, word("supports")),
+            [
+                (
+                    *(str(row["matcher"]), str(row["method"]), float(row["risk"])),
+                    *(share_cell(row, area) for area in _AREAS),
+                    *(int(row["n"]), str(row["supports"])),
+                )
+                for row in records_of(order)
+            ],
+            notes=[f"Alert limits of {others} m: protection.parquet holds them."] if others else (),
+        )
 
 
 def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
@@ -820,69 +819,51 @@ def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
     Those of most places come first. The first two lines count places and queries. Kinds with too few places to rank
     anybody are marked.
     """
-    groups = sorted(scenes.groupby(list(GROUP)), key=lambda group: (-int(group[1]["places"].max()), group[0]))
-    for key, part in groups:
+    parts = scenes.groupby(list(GROUP)) if len(scenes) else ()
+    for key, part in sorted(parts, key=lambda group: (-int(group[1]["places"].max()), group[0])):
+        suite, track, prior_group = map(str, key)
         found: dict[str, dict[str, Record]] = {}
         for row in records_of(part):
             found.setdefault(str(row["stratum"]), {})[str(row["matcher"])] = row
-        yield _table((str(key[0]), str(key[1]), str(key[2])), found, book)
-
-
-def _table(key: Key, found: _Found, book: Book) -> Table:
-    suite, track, prior_group = key
-    use = AS_USED[suite.partition(BY)[0]]
-    kinds = [kind for kind in (ALL, *SCENES) if kind in found]
-    primary = str(next(iter(found[ALL].values()))["metric"])
-    order = sorted(found[ALL], key=lambda name: (-_scene_value(found[ALL][name]), name))
-    rows = [
-        Row(
-            cells=(
-                book.short_name(name),
-                *(short_cell(found[kind].get(name), is_rivalled=len(order) > 1) for kind in kinds),
+        use, card = AS_USED[suite.partition(BY)[0]], suite_card(suite)
+        kinds = [kind for kind in (ALL, *SCENES) if kind in found]
+        primary = str(next(iter(found[ALL].values()))["metric"])
+        order = sorted(found[ALL], key=lambda name: (-_value(found[ALL][name]), name))
+        first = [next(iter(found[kind].values())) for kind in kinds]
+        places = [
+            replace(plain_cell(int(row["places"])), marks=(FEW,) if row["places"] < LEAST_PLACES else ())
+            for row in first
+        ]
+        figures = [[short_cell(found[kind].get(name), is_rivalled=len(order) > 1) for kind in kinds] for name in order]
+        meaning = f"{column('kind of place').meaning}. {primary}: {column(primary).meaning}"
+        notes = [suite_words(suite)]
+        if card is not None and use.strength is not None:
+            notes.append(
+                f"Only views of strength {use.strength:g} ({card.strength_unit}), as they are expected in use."
             )
+        yield grid_of(
+            file_stem("kinds", suite, track, prior_group),
+            f"With {use.words} ({suite}): {primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
+            (word("matcher"), *(replace(column(primary, title=kind), meaning=meaning) for kind in kinds)),
+            [
+                ("places", *places),
+                ("queries", *(int(row["n"]) for row in first)),
+                *((book.short_name(name), *line) for name, line in zip(order, figures, strict=True)),
+            ],
+            notes=notes,
+            tones=["head", "head", *["plain"] * len(order)],
         )
-        for name in order
-    ]
-    return Table(
-        name=file_stem("kinds", suite, track, prior_group),
-        title=f"With {use.words} ({suite}): {primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-        columns=(*words("matcher"), *(_column(kind, primary) for kind in kinds)),
-        rows=(*_scene_heads(found, kinds), *rows),
-        notes=tuple(_scene_notes(suite, use.strength)),
-    )
-
-
-def _scene_value(row: Record) -> float:
-    return -math.inf if math.isnan(row["value"]) else float(row["value"])
-
-
-def _column(kind: str, primary: str) -> Column:
-    """Return the column of a kind, which says what its figure is a share of."""
-    what = column("kind of place")
-    return replace(column(primary, title=kind), meaning=f"{what.meaning}. {primary}: {column(primary).meaning}")
-
-
-def _scene_heads(found: _Found, kinds: list[str]) -> Iterator[Row]:
-    """Yield the lines that count places and queries, those with too few places marked."""
-    first = [next(iter(found[kind].values())) for kind in kinds]
-    places = [
-        replace(plain_cell(int(row["places"])), marks=(FEW,) if row["places"] < LEAST_PLACES else ()) for row in first
-    ]
-    yield Row(cells=(Cell(text="places"), *places), tone="head")
-    yield Row(cells=(Cell(text="queries"), *(plain_cell(int(row["n"])) for row in first)), tone="head")
-
-
-def _scene_notes(suite: str, strength: float | None) -> Iterator[str]:
-    """Yield what is done in a suite, and which of its views are meant where these are not all."""
-    yield suite_words(suite)
-    card = suite_card(suite)
-    if card is not None and strength is not None:
-        yield f"Only views of strength {strength:g} ({card.strength_unit}), as they are expected in use."
 
 
 _CONTROLS_NOTE: Final = (
     "The right score of these queries is known beforehand. At chance: views of a shuffled map, of a map turned by "
     "half, and of one of two places that are the same."
+)
+_SEEDS_NOTE: Final = (
+    "The same matchers, by version and hash, on the same pipeline drawn by a private seed. The sites differ, so no "
+    "query pairs with another: draws resample blocks of ground with the queries of both seeds that lie in them. All "
+    "intervals of a matcher hold at once (95 %). Shown are the figures over all suites, and whatever is worse on the "
+    "private seed."
 )
 _FALSIFIERS_NOTE: Final = (
     "The entries of each contrast where the difference between them is taken away: at the same places without the "
@@ -891,59 +872,34 @@ _FALSIFIERS_NOTE: Final = (
 )
 
 
-def seed_table(entries: Sequence[BoardEntry]) -> Table | None:
+def seed_table(entries: Sequence[BoardEntry]) -> Table:
     """Return figures on the public and on a private seed: of all suites, and whatever is shown to be worse.
 
-    None where no row was compared with a private seed.
+    No rows where none was compared with a private seed.
     """
-    rows = [
-        Row(
-            cells=text_cells(
-                entry.name,
-                item.suite,
-                item.track,
-                item.metric,
-                number_text(item.public),
-                number_text(item.private),
-                interval_text(item.difference, item.lo, item.hi),
-                f"{item.n_public} and {item.n_private}",
-                f"{item.blocks_public} and {item.blocks_private}, {item.blocks_shared} in both",
-                "worse" if item.is_worse else "not shown to be worse",
-            )
-        )
+    shown = [
+        (entry.name, item)
         for entry in entries
         for item in (() if entry.private is None else entry.private.figures)
         if item.suite == ALL_SUITES or item.is_worse
     ]
-    if not rows:
-        return None
-    numbers = tuple(map(column, ("public", "private", "private less public", "n", "blocks")))
-    columns = (*words("matcher", "suite", "track", "figure"), *numbers, *words("shown"))
-    title = "Public and private seed"
-    return Table(name="seeds", title=title, columns=columns, rows=tuple(rows), notes=(SEEDS_NOTE,))
-
-
-def control_table(verdicts: Sequence[Verdict]) -> Table | None:
-    """Return every control of every matcher; None where none was drawn."""
-    if not verdicts:
-        return None
-    rows = tuple(
-        Row(
-            cells=(
-                *text_cells(item.control, item.matcher),
-                plain_cell(item.n),
-                Cell(text=tally_text(item.found), key=item.found),
-                Cell(text=tally_text(item.expected), key=item.expected),
-                p_cell(item.p),
-                _limit_cell(item),
-                Cell(text="held" if item.holds else "FAILED"),
-            )
-        )
-        for item in verdicts
+    fields: tuple[Field[tuple[str, SeedFigure]], ...] = (
+        (word("matcher"), lambda one: one[0]),
+        (word("suite"), lambda one: one[1].suite),
+        (word("track"), lambda one: one[1].track),
+        (word("figure"), lambda one: one[1].metric),
+        (column("public"), lambda one: number_text(one[1].public)),
+        (column("private"), lambda one: number_text(one[1].private)),
+        (column("private less public"), lambda one: interval_text(one[1].difference, one[1].lo, one[1].hi)),
+        (column("n"), lambda one: f"{one[1].n_public} and {one[1].n_private}"),
+        (column("blocks"), lambda one: _blocks_text(one[1])),
+        (word("shown"), lambda one: "worse" if one[1].is_worse else "not shown to be worse"),
     )
-    first = column("control query", is_number=False, title="control")
-    columns = (first, *words("matcher"), *map(column, ("n", "found", "expected", "p", "fails at")), *words("outcome"))
-    return Table(name="controls", title="Controls, one by one", columns=columns, rows=rows, notes=(_CONTROLS_NOTE,))
+    return table_of("seeds", "Public and private seed", shown, fields, notes=(_SEEDS_NOTE,))
+
+
+def _blocks_text(item: SeedFigure) -> str:
+    return f"{item.blocks_public} and {item.blocks_private}, {item.blocks_shared} in both"
 
 
 def _limit_cell(verdict: Verdict) -> Cell:
@@ -954,61 +910,74 @@ def _limit_cell(verdict: Verdict) -> Cell:
     return Cell(text="never") if limit is None else plain_cell(limit)
 
 
+_OF_CONTROLS: Final[tuple[Field[Verdict], ...]] = (
+    (word("control query", title="control"), lambda item: item.control),
+    (word("matcher"), lambda item: item.matcher),
+    (column("n"), lambda item: item.n),
+    (column("found"), lambda item: Cell(text=tally_text(item.found), key=item.found)),
+    (column("expected"), lambda item: Cell(text=tally_text(item.expected), key=item.expected)),
+    (column("p"), lambda item: p_cell(item.p)),
+    (column("fails at"), _limit_cell),
+    (word("outcome"), lambda item: "held" if item.holds else "FAILED"),
+)
+
+
+def control_table(verdicts: Sequence[Verdict]) -> Table:
+    """Return every control of every matcher."""
+    return table_of("controls", "Controls, one by one", verdicts, _OF_CONTROLS, notes=(_CONTROLS_NOTE,))
+
+
+def _side(name: str, value: float) -> Cell:
+    return Cell(text=f"{name}: {number_text(value)}", key=sort_key(value))
+
+
+def _difference(item: Finding) -> Cell:
+    return Cell(text=interval_text(item.difference, item.lo, item.hi), key=sort_key(item.difference))
+
+
+_BY_COUNTRIES: Final = "by countries"
+_OF_CONTRASTS: Final[tuple[Field[Finding], ...]] = (
+    (word("contrast"), lambda item: item.name),
+    (column("first"), lambda item: _side(item.first, item.first_value)),
+    (column("second"), lambda item: _side(item.second, item.second_value)),
+    (column("difference"), _difference),
+    (column("by blocks"), lambda item: _ends_text(item.lo_blocks, item.hi_blocks)),
+    (column(_BY_COUNTRIES), lambda item: _ends_text(item.lo_countries, item.hi_countries)),
+    (column("attainable"), lambda item: item.attainable),
+    (column("matters"), lambda item: item.least),
+    (column("p (Holm)"), lambda item: p_cell(item.p_holm)),
+    (column("discordant"), lambda item: "-" if item.metric in AREAS else _discordant_text(item)),
+    (column("detectable"), lambda item: item.detectable),
+    (column("n"), lambda item: Cell(text=_counts_text(item), key=float(item.n))),
+    (word("verdict"), lambda item: item.verdict),
+)
+
+
+_OF_FALSIFIERS: Final[tuple[Field[Falsifier], ...]] = (
+    (word("contrast"), lambda item: item.contrast),
+    (word("suite"), lambda item: item.suite),
+    (word("kind"), lambda item: item.kind),
+    (column("first"), lambda item: _side(item.finding.first, item.finding.first_value)),
+    (column("second"), lambda item: _side(item.finding.second, item.finding.second_value)),
+    (column("difference"), lambda item: _difference(item.finding)),
+    (column("discordant"), lambda item: _discordant_text(item.finding)),
+    (column("n"), lambda item: Cell(text=_counts_text(item.finding), key=float(item.finding.n))),
+    (word("verdict"), lambda item: item.verdict),
+)
+
+
 def contrast_table(findings: Sequence[Finding]) -> Table:
     """Return the registered contrasts; intervals by countries where places share some."""
-    has_countries = any(not math.isnan(item.lo_countries) for item in findings)
-    rows = tuple(
-        Row(
-            cells=(
-                Cell(text=item.name),
-                *_sides(item),
-                Cell(text=_ends_text(item.lo_blocks, item.hi_blocks)),
-                *((Cell(text=_ends_text(item.lo_countries, item.hi_countries)),) if has_countries else ()),
-                number_cell(item.attainable),
-                number_cell(item.least),
-                p_cell(item.p_holm),
-                Cell(text="-" if item.metric in AREAS else f"{item.first_only} and {item.second_only}"),
-                number_cell(item.detectable),
-                Cell(text=_counts_text(item), key=float(item.n)),
-                Cell(text=item.verdict),
-            )
-        )
-        for item in findings
-    )
-    names = (
-        *("first", "second", "difference", "by blocks", *(("by countries",) if has_countries else ())),
-        *("attainable", "matters", "p (Holm)", "discordant", "detectable", "n"),
-    )
-    columns = (*words("contrast"), *map(column, names), *words("verdict"))
-    return Table(name="contrasts", title="Registered contrasts", columns=columns, rows=rows)
+    return table_of("contrasts", "Registered contrasts", findings, _OF_CONTRASTS).without_empty(_BY_COUNTRIES)
 
 
 def falsifier_table(found: Sequence[Falsifier]) -> Table:
     """Return the entries of each contrast where they should not differ."""
-    rows = tuple(
-        Row(
-            cells=(
-                *text_cells(item.contrast, item.suite, item.kind),
-                *_sides(item.finding),
-                Cell(text=f"{item.finding.first_only} and {item.finding.second_only}"),
-                Cell(text=_counts_text(item.finding), key=float(item.finding.n)),
-                Cell(text=item.verdict),
-            )
-        )
-        for item in found
-    )
-    numbers = tuple(map(column, ("first", "second", "difference", "discordant", "n")))
-    columns = (*words("contrast", "suite", "kind"), *numbers, *words("verdict"))
-    return Table(name="falsifiers", title="Falsifiers", columns=columns, rows=rows, notes=(_FALSIFIERS_NOTE,))
+    return table_of("falsifiers", "Falsifiers", found, _OF_FALSIFIERS, notes=(_FALSIFIERS_NOTE,))
 
 
-def _sides(item: Finding) -> tuple[Cell, ...]:
-    """Return what both entries of a contrast reach, and their difference."""
-    return (
-        Cell(text=f"{item.first}: {number_text(item.first_value)}", key=sort_key(item.first_value)),
-        Cell(text=f"{item.second}: {number_text(item.second_value)}", key=sort_key(item.second_value)),
-        Cell(text=interval_text(item.difference, item.lo, item.hi), key=sort_key(item.difference)),
-    )
+def _discordant_text(item: Finding) -> str:
+    return f"{item.first_only} and {item.second_only}"
 
 
 def _ends_text(lo: float, hi: float) -> str:

@@ -11,14 +11,10 @@ from sasgeo_bench.files.folders import SITE
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra, read_board_manifest
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
-from sasgeo_bench.leaderboard.board_tables import acceptance_tables, step_tables
-from sasgeo_bench.leaderboard.plots import (
-    age_names,
-    ages_frame,
-)
+from sasgeo_bench.leaderboard.plots import age_names, ages_frame
 from sasgeo_bench.leaderboard.score import score_board
 from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
-from sasgeo_bench.leaderboard.text import board_latex, board_markdown
+from sasgeo_bench.leaderboard.text import LATEX, MARKDOWN, Contents, board_latex, board_markdown
 from sasgeo_bench.progress import tell
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.strata import queries_of, steps_frame
@@ -90,16 +86,15 @@ def board_texts(scored: Scored) -> Extra:
     """Return the tables of a board as a document and for a paper."""
     board, queries = scored.board, queries_of(scored.scores)
     steps = steps_frame(board.leaderboard, queries, sorted(scored.scores))
-    found = {"findings": board.findings, "verdicts": board.verdicts}
-    others = (
-        *acceptance_tables(board.acceptance),
-        *step_tables(steps, age_names(ages_frame(steps, queries, scored.measured))),
+    of = Contents(
+        leaderboard=board.leaderboard,
+        entries=board.about.entries,
+        metrics=board.about.metrics,
+        findings=board.findings,
+        falsifiers=scored.falsifiers,
+        verdicts=board.verdicts,
+        acceptance=board.acceptance,
+        steps=steps,
+        ages=age_names(ages_frame(steps, queries, scored.measured)),
     )
-    return Extra(
-        texts={
-            "leaderboard.md": board_markdown(
-                board.leaderboard, board.about, falsifiers=scored.falsifiers, others=others, **found
-            ),
-            "leaderboard.tex": board_latex(board.leaderboard, board.about, **found),
-        }
-    )
+    return Extra(texts={MARKDOWN: board_markdown(board.about, of), LATEX: board_latex(board.about, of)})

@@ -34,7 +34,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypedDict
 
 import cv2
 import numpy as np
@@ -180,16 +180,15 @@ def sample_cases(cases: pd.DataFrame, *, each: int, most: int = MOST_CASES) -> p
     ranked = cases.assign(
         _class=cases["failure"].map(FAILURES.index),
         _who=cases["matcher"].map(matchers.index),
-        _mark=[_mark(*names) for names in zip(cases["matcher"], cases["query_id"], strict=True)],
+        _mark=[
+            hashlib.sha256(f"{matcher}/{query_id}".encode()).hexdigest()
+            for matcher, query_id in zip(cases["matcher"], cases["query_id"], strict=True)
+        ],
     ).sort_values(["_class", "_who", "_mark"])
     ranked = ranked.assign(_round=ranked.groupby(["_class", "_who"]).cumcount())
     chosen = ranked[ranked["_round"] < each].sort_values(["_round", "_class", "_who"], kind="stable").head(most)
     chosen = chosen.sort_values(["_class", "_who", "_round"], kind="stable")
     return chosen[list(cases.columns)].reset_index(drop=True)
-
-
-def _mark(matcher: str, query_id: str) -> str:
-    return hashlib.sha256(f"{matcher}/{query_id}".encode()).hexdigest()
 
 
 def count_cases(cases: pd.DataFrame) -> dict[str, int]:
@@ -198,7 +197,15 @@ def count_cases(cases: pd.DataFrame) -> dict[str, int]:
     return {name: int(counts.get(name, 0)) for name in FAILURES}
 
 
-def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_id: str) -> dict[str, Any]:
+class Words(TypedDict):
+    """What rejectors state of one answer, by rejector: chance to be false, or an order, and whether it is accepted."""
+
+    p_false: dict[str, float]
+    orders: dict[str, float]
+    accepted: dict[str, bool]
+
+
+def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_id: str) -> Words:
     """Return what rejectors state of one answer: chance to be false or rank, and whether they accept it.
 
     `words` are rows of `RejectionResult` by matcher and rejector, with the query ids as index.
@@ -215,7 +222,7 @@ def words_of(words: Mapping[tuple[str, str], pd.DataFrame], matcher: str, query_
             (p_false if is_chance else orders)[rejector] = 1.0 - float(row["p_right"])
         if pd.notna(row[OPERATING]) and row["is_answered"]:
             accepted[rejector] = bool(row[OPERATING])
-    return {"p_false": p_false, "orders": orders, "accepted": accepted}
+    return Words(p_false=p_false, orders=orders, accepted=accepted)
 
 
 WEBP: Final = ".webp"
@@ -381,6 +388,14 @@ def disc_of(query: Query) -> tuple[float, float, float] | None:
     return None if center_m is None or radius_m is None or query.candidates else (*center_m, radius_m)
 
 
+def window_around(grid: Grid, middle_m: NDArray[np.float64], half_m: float) -> tuple[int, int, int, int]:
+    """Return row, column, rows and columns of a square around a point, as far as the map reaches."""
+    ends = grid.to_cells(middle_m + half_m * np.array([(-1.0, 1.0), (1.0, -1.0)]))
+    row, col = np.clip(ends[0], 0, [grid.rows - 1, grid.cols - 1]).tolist()
+    end_row, end_col = np.clip(ends[1] + 1, [row + 1, col + 1], [grid.rows, grid.cols]).tolist()
+    return (row, col, end_row - row, end_col - col)
+
+
 def seen_at(pose: Pose, view: Evidence, layers: LayerBits, grid: Grid, manifest: Manifest) -> Evidence:
     """Return the map at a place as a view of the size and classes of `view`."""
     cells = observe(layers, grid, pose, size_cells=view.shape[0], cell_size_m=view.cell_size_m)
@@ -446,7 +461,10 @@ def draw_map(chart: Axes, case: CasePicture) -> None:
     chart.set_facecolor(HIDDEN)
     chart.add_patch(Rectangle((0, 0), width_m, height_m, color="white", lw=0, zorder=-1))
     without_ticks(chart)
-    chart.set_title(f"map, north up, {side_m:.0f} m across:\n{_key(case)}", fontsize=7.5)
+    shown = [("true place solid" if case.is_present else "where it was taken solid", case.true is not None)]
+    shown += [("answer dashed", bool(case.modes)), ("search dotted", case.disc is not None)]
+    key = ", ".join(name for name, is_there in shown if is_there)
+    chart.set_title(f"map, north up, {side_m:.0f} m across:\n{key}", fontsize=7.5)
     if case.disc is not None:
         easting_m, northing_m, radius_m = case.disc
         middle = (easting_m - part.west_m, northing_m - part.south_m)
@@ -463,13 +481,6 @@ def draw_map(chart: Axes, case: CasePicture) -> None:
     if case.true is not None and case.modes:
         _offset(chart, case, part)
     scale_bar(chart, side_m, side_m)
-
-
-def _key(case: CasePicture) -> str:
-    """Describe what is drawn on the map."""
-    shown = [("true place solid" if case.is_present else "where it was taken solid", case.true is not None)]
-    shown += [("answer dashed", bool(case.modes)), ("search dotted", case.disc is not None)]
-    return ", ".join(name for name, is_there in shown if is_there)
 
 
 def _at(pose: Pose, part: MapPart) -> tuple[float, float]:
@@ -587,7 +598,13 @@ def plot_query(query: Query, region: Region, truth: Truth | None = None) -> Figu
     check_given(region, Region, "read_region reads one from its folder")
     if truth is not None:
         check_given(truth, Truth, "read_truths reads those of a task")
-    _check(query, region, truth)
+    name = region.manifest.id
+    if base_of(query.region) != base_of(name):
+        raise ConfigError(f"query {query.query_id!r} searches the map {query.region!r}, got {name!r}: read that region")
+    if truth is not None and truth.query_id != query.query_id:
+        raise ConfigError(
+            f"the truth is of query {truth.query_id!r}, the query is {query.query_id!r}: give its own truth"
+        )
     case = _content(query, region, truth)
     panels = [("view", case.view), ("map at the true place", case.at_true)][: 1 + (case.at_true is not None)]
     count = len(panels) + (case.picture is not None)
@@ -602,20 +619,11 @@ def plot_query(query: Query, region: Region, truth: Truth | None = None) -> Figu
         for chart, (name, evidence) in zip(small, panels, strict=True):
             draw_panel(chart, name, evidence)
         draw_map(large, case)
-        _draw_candidates(large, query, case.part)
+        at = [(pose.easting_m - case.part.west_m, pose.northing_m - case.part.south_m) for pose in query.candidates]
+        if at:
+            large.plot(*np.transpose(at), color=_CANDIDATE, marker="x", ms=5, ls="")
         figure.arrange()
     return figure
-
-
-def _check(query: Query, region: Region, truth: Truth | None) -> None:
-    """Refuse a map or a truth that is not the query's."""
-    name = region.manifest.id
-    if base_of(query.region) != base_of(name):
-        raise ConfigError(f"query {query.query_id!r} searches the map {query.region!r}, got {name!r}: read that region")
-    if truth is not None and truth.query_id != query.query_id:
-        raise ConfigError(
-            f"the truth is of query {truth.query_id!r}, the query is {query.query_id!r}: give its own truth"
-        )
 
 
 def _content(query: Query, region: Region, truth: Truth | None) -> CasePicture:
@@ -648,16 +656,7 @@ def _window(query: Query, grid: Grid) -> tuple[int, int, int, int]:
     if disc is None:
         return (0, 0, grid.rows, grid.cols)
     half_m = _ROOM * (disc[2] + float(np.hypot(*query.evidence.size_m)) / 2)
-    ends = grid.to_cells(np.array(disc[:2]) + half_m * np.array([(-1.0, 1.0), (1.0, -1.0)]))
-    row, col = np.clip(ends[0], 0, [grid.rows - 1, grid.cols - 1]).tolist()
-    end_row, end_col = np.clip(ends[1] + 1, [row + 1, col + 1], [grid.rows, grid.cols]).tolist()
-    return (row, col, end_row - row, end_col - col)
-
-
-def _draw_candidates(chart: Axes, query: Query, part: MapPart) -> None:
-    at = [(pose.easting_m - part.west_m, pose.northing_m - part.south_m) for pose in query.candidates]
-    if at:
-        chart.plot(*np.transpose(at), color=_CANDIDATE, marker="x", ms=5, ls="")
+    return window_around(grid, np.array(disc[:2]), half_m)
 
 
 def _keys(case: CasePicture, region: Region) -> list[Artist]:

@@ -4,9 +4,9 @@
 Each figure has a line for each matcher, and a panel for each kind of flight of a suite; of drift for each suite.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -25,11 +25,10 @@ from sasgeo_bench.leaderboard.plots import (
     dodged,
     draw_line,
     dress_share,
-    label_outer,
+    each_panel,
     line_keys,
     look_of,
     of_which,
-    panels_across,
     those_there,
     ticks_across,
 )
@@ -46,10 +45,6 @@ _ACROSS: Final = 3
 _INCHES: Final = 3.4
 _ONE_INCHES: Final = 6.4  # of a panel alone
 _RIGHT, _FALSE, _WITHHELD = "#00897b", "#d50000", "#5c6bc0"
-_LINE: Final[dict[str, Any]] = {"color": _WITHHELD, "lw": 1.0}
-_IS_RIGHT: Final[dict[str, Any]] = {"color": "none", "marker": "o", "mfc": _RIGHT, "mec": "white", "ms": 6}
-_IS_FALSE: Final[dict[str, Any]] = {"color": "none", "marker": "X", "mfc": _FALSE, "mec": "white", "ms": 7}
-_IS_WITHHELD: Final[dict[str, Any]] = {"color": "none", "marker": "o", "mfc": _WITHHELD, "mec": "none", "ms": 4}
 
 
 def shown_flight(scores: Mapping[str, pd.DataFrame], suite: str, regions: Sequence[str]) -> tuple[str, str] | None:
@@ -118,12 +113,16 @@ def _keys(shown: Sequence[pd.DataFrame]) -> list[Line2D]:
     accepted, is_near = _judged(views)
     is_posed = views["east_m"].notna().to_numpy(bool)
     kinds = (
-        (is_posed, "estimates, in order", _LINE),
-        (accepted & is_near, f"accepted, within {FIX_M:g} m", _IS_RIGHT),
-        (accepted & ~is_near, f"accepted, beyond {FIX_M:g} m", _IS_FALSE),
-        (is_posed & ~accepted, "not accepted", _IS_WITHHELD),
+        (is_posed, Line2D([], [], color=_WITHHELD, lw=1.0, label="estimates, in order")),
+        (accepted & is_near, _dot(f"accepted, within {FIX_M:g} m", "o", _RIGHT, "white", 6)),
+        (accepted & ~is_near, _dot(f"accepted, beyond {FIX_M:g} m", "X", _FALSE, "white", 7)),
+        (is_posed & ~accepted, _dot("not accepted", "o", _WITHHELD, "none", 4)),
     )
-    return [Line2D([], [], label=label, **style) for marked, label, style in kinds if marked.any()]
+    return [key for marked, key in kinds if marked.any()]
+
+
+def _dot(label: str, marker: str, fill: str, edge: str, points: float) -> Line2D:
+    return Line2D([], [], color="none", marker=marker, mfc=fill, mec=edge, ms=points, label=label)
 
 
 def _judged(views: pd.DataFrame) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -167,6 +166,7 @@ _MOST_ERROR_M: Final = 10_000.0
 _ERROR_TICKS_M: Final = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
 _ALL: Final = 100.0  # percent
 _METRICS: Final = {f"reckoned_{far_m:g}m": far_m for far_m in RECKONED_M}
+_WITHIN_LABEL: Final = f"share of the way\nwithin {FIX_M:g} m"
 DISTANCE_COLUMNS: Final = (*GROUP, "kind", "matcher", "distance_m", "flights", *_SHARES)
 INTERVAL_COLUMNS: Final = (*GROUP, "kind", "matcher", "every_m", "n", "blocks", "value", "lo", "hi")
 DRIFT_COLUMNS: Final = (*GROUP, "kind", "matcher", "drift", "n", "blocks", "value", "lo", "hi")
@@ -244,7 +244,8 @@ def draw_distance(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         "fewer than two flights reach is not drawn."
     )
     title = f"Error along the way: {of_which(rows.iloc[0])}"
-    for chart, kind, number, across in _panels(path, kinds, names, title, note, "flown from the start (km)"):
+    about = BoardPage(title=title, note=note, below="flown from the start (km)", keys=line_keys(names))
+    for chart, kind in each_panel(path, kinds, about, "error of the estimate (m)"):
         mine = rows[rows["kind"] == kind]
         flights = int(mine["flights"].max())
         chart.set_title(f"{kind}\n{counted(flights, 'flight')} at most")
@@ -260,7 +261,6 @@ def draw_distance(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             half, most = (np.clip(line[column].to_numpy(float), _LEAST_ERROR_M, _MOST_ERROR_M) for column in _SHARES)
             chart.plot(far_km, half, color=look.colour, ls=look.dash, lw=1.4)
             chart.plot(far_km, most, color=look.colour, ls=look.dash, lw=0.8, alpha=0.45)
-        label_outer(chart, number, across, len(kinds), "error of the estimate (m)")
         chart.tick_params(labelbottom=True)
 
 
@@ -273,7 +273,8 @@ def draw_intervals(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None
         f"The tracker itself was shown every view. Dashed: 95 %. {INTERVALS}"
     ).replace("n: queries of each point.", "")
     title = f"How far the odometer carries a fix: {of_which(rows.iloc[0])}"
-    for chart, kind, number, across in _panels(path, kinds, names, title, note, "flown between two uses of a fix (m)"):
+    about = BoardPage(title=title, note=note, below="flown between two uses of a fix (m)", keys=line_keys(names))
+    for chart, kind in each_panel(path, kinds, about, _WITHIN_LABEL):
         mine = rows[rows["kind"] == kind]
         many = (counted(int(mine[name].iloc[0]), word) for name, word in (("n", "flight"), ("blocks", "block")))
         chart.set_title(f"{kind}\n{', '.join(many)}")
@@ -284,7 +285,6 @@ def draw_intervals(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None
         for at, name in enumerate(names):
             line = mine[mine["matcher"] == name].sort_values("every_m")
             draw_line(chart, line, dodged(line["every_m"].to_numpy(float), at, len(names), by=0.03), at)
-        label_outer(chart, number, across, len(kinds), f"share of the way\nwithin {FIX_M:g} m")
 
 
 def draw_drift(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
@@ -295,7 +295,8 @@ def draw_drift(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         f"{DRIFT_M:g} m after a true pose, over the way flown. Stress and falsifiers. {INTERVALS}"
     ).replace("n: queries of each point.", "")
     title = "Success against the drift of the odometer"
-    for chart, kind, number, across in _panels(path, kinds, names, title, note, "drift of the odometer (% of the way)"):
+    about = BoardPage(title=title, note=note, below="drift of the odometer (% of the way)", keys=line_keys(names))
+    for chart, kind in each_panel(path, kinds, about, _WITHIN_LABEL):
         mine = rows[rows["kind"] == kind]
         chart.set_title(f"{kind}\n{counted(int(mine['n'].min()), 'flight')} at least")
         chart.set_xlim(-0.5, len(bins) - 0.5)
@@ -306,7 +307,6 @@ def draw_drift(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             line = mine[mine["matcher"] == name].sort_values("drift")
             aside = 0.06 * (at - (len(names) - 1) / 2)
             draw_line(chart, line, np.array([bins.index(one) for one in line["drift"]]) + aside, at)
-        label_outer(chart, number, across, len(kinds), f"share of the way\nwithin {FIX_M:g} m")
 
 
 def _percent(name: str) -> str:
@@ -317,14 +317,3 @@ def _percent(name: str) -> str:
     """
     low, high = (100 * float(end) for end in name.split("-"))
     return f"{low:g} to {high:g}" if high < _ALL else f"{low:g} and more"
-
-
-def _panels(
-    path: Path, kinds: Sequence[str], names: Sequence[str], title: str, note: str, below: str
-) -> Iterator[tuple[Axes, str, int, int]]:
-    """Yield the axes of each kind with its number and the number of columns."""
-    down, across = panels_across(len(kinds))
-    about = BoardPage(title=title, note=note, below=below, rows=down, columns=across, keys=line_keys(names))
-    with page(path, about) as charts:
-        for number, chart in panels(charts, len(kinds)):
-            yield chart, kinds[number], number, across

@@ -8,7 +8,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 
 from sasgeo_bench.config import Record
 from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.matching.cards import Learned
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Provenance
 from sasgeo_bench.running.prediction_files import CardRecord
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast
@@ -62,15 +63,6 @@ class PackManifest(Record):
     files: dict[str, Sha256] | None = None  # of the first version there are none
     licence: str = LICENCE
     attribution: str = ATTRIBUTION
-
-
-class Learned(Record):
-    """A training by the runner: the file that was learned, if any, and the tasks that were asked under it."""
-
-    file: str | None
-    trained_on: list[str]
-    pairs: int
-    asked: list[str]
 
 
 class SeedRecord(Record):
@@ -160,7 +152,7 @@ class BoardEntry(Record):
 class BoardTask(Record):
     """A task that a board asked."""
 
-    without_empty: ClassVar = frozenset({"failed_pictures"})
+    without_empty: ClassVar = frozenset({"failed_pictures", "provenance"})
 
     region: str
     suite: str
@@ -169,6 +161,7 @@ class BoardTask(Record):
     queries_sha256: str | None = None
     map_fingerprint: str | None = None
     failed_pictures: int | None = None
+    provenance: Provenance = Provenance()  # of the map
 
 
 class ElsewhereRow(Record):
@@ -203,6 +196,32 @@ class RejectorRecord(Record):
     is_calibrated: bool | None = None
 
 
+class MetricRecord(Record):
+    """A metric of another package: what tables show of it, and its `code`, as module:NAME, with its SHA-256.
+
+    A bound that is missing is infinite.
+    """
+
+    name: str
+    code: str
+    sha256: Sha256
+    meaning: str
+    source: str
+    unit: str
+    better: Literal["higher", "lower"]
+    least: float | None = None
+    greatest: float | None = None
+    tracks: list[str]
+
+    def to_text(self) -> str:
+        """Return in a line what it says, of what, and whose it is."""
+        least, greatest = ("any" if end is None else f"{end:g}" for end in (self.least, self.greatest))
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        whose = f"a metric of {self.code} ({self.sha256[:12]}), not of sasgeo-bench"
+        said = f"{self.meaning.removesuffix('.')}. {self.better.capitalize()} is better, {least} to {greatest}{unit}"
+        return f"{said}; {whose}"
+
+
 class BoardManifest(Record):
     """All of `board.json`; every board has the fields without a default.
 
@@ -210,7 +229,9 @@ class BoardManifest(Record):
     []
     """
 
-    without_empty: ClassVar = frozenset({"title", "private_seed", "private", "sealed", "elsewhere", "failed"})
+    without_empty: ClassVar = frozenset(
+        {"title", "private_seed", "private", "sealed", "metrics", "elsewhere", "failed"}
+    )
 
     scorer_version: int
     entries: list[BoardEntry]
@@ -231,6 +252,7 @@ class BoardManifest(Record):
     by_block: list[str] = []
     without: list[str] = []
     rejectors: list[RejectorRecord] = []
+    metrics: list[MetricRecord] = []
     remarks: list[str] = []
     elsewhere: list[Elsewhere] = []
     failed: dict[str, str] = {}

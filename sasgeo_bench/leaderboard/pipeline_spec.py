@@ -291,6 +291,7 @@ class PipelineFile(NamedDocument):
     reference_imagery: ReferenceImagerySpec | None = None
     matchers: Annotated[list[str], Field(min_length=1)]
     rejectors: list[str] = []
+    metrics: list[str] = []
     contrast: list[ContrastSpec] = []
     top_k: Annotated[int, Field(ge=1, le=1000)] = 25
     match_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
@@ -300,7 +301,9 @@ class PipelineFile(NamedDocument):
     @property
     def sha256(self) -> str:
         """Hash of all that it says of the experiment, defaults among it, as `board.json` names it."""
-        unsaid = {"archive"} | {name for name in ("learning", "reference_imagery") if getattr(self, name) is None}
+        unsaid = {"archive"} | {
+            name for name in ("learning", "reference_imagery", "metrics") if not getattr(self, name)
+        }
         fields = self.model_dump(mode="json", exclude=unsaid)
         pilots = [item["pilot"] for item in fields["contrast"] if item["pilot"] is not None]
         named = {**fields, "pilot": pilots}
@@ -341,6 +344,7 @@ class PipelineFile(NamedDocument):
             *(("region", task.regions) for task in self.task),
             ("matcher", self.matchers),
             ("rejector", self.rejectors),
+            ("metric", self.metrics),
             ("contrast", [item.name for item in self.contrast]),
             ("suite to learn from", [] if self.learning is None else self.learning.suites),
             ("seed", [] if self.paper is None else [str(seed) for seed in self.paper.seeds]),

@@ -5,7 +5,7 @@ Each function writes a .svg or .png; `shown` are the matchers in the order of th
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -353,26 +353,33 @@ def panel_title(chart: Axes, name: str, row: Mapping[str, Any] | pd.Series) -> N
     chart.set_title(f"{name}\nn {row['n']:g}, {counted(int(row['blocks']), 'block')}")
 
 
+def each_panel(path: Path, names: Sequence[str], about: Page, label: str = "") -> Iterator[tuple[Axes, str]]:
+    """Yield a panel for each name, with a `label` if it stands at the edge; the page is written when all are drawn."""
+    down, across = panels_across(len(names))
+    with page(path, replace(about, rows=down, columns=across)) as charts:
+        for number, chart in panels(charts, len(names)):
+            if label:
+                label_outer(chart, number, across, len(names), label)
+            yield chart, names[number]
+
+
 def draw_bar_panels(
     path: Path, rows: pd.DataFrame, shown: Sequence[str], column: str, values: Sequence[str], *, title: str, note: str
 ) -> None:
     """Draw success as bars with intervals: a panel for each value of a column, a bar for each matcher."""
-    names, (down, across) = those_there(rows, shown), panels_across(len(values))
+    names, across = those_there(rows, shown), panels_across(len(values))[1]
     about = BoardPage(
         title=title,
         note=note,
         below=PRIMARY[primary_of(str(rows["track"].iloc[0])).name].replace("\n", " "),
-        rows=down,
-        columns=across,
         panel_inches=(1.9, 0.3 + 0.19 * len(names)),
     )
-    with page(path, about) as charts:
-        for number, chart in panels(charts, len(values)):
-            mine = rows[rows[column] == values[number]]
-            panel_title(chart, values[number], mine.iloc[0])
-            draw_board_bars(chart, mine, names)
-            if number % across:
-                chart.set_yticklabels([])
+    for chart, value in each_panel(path, values, about):
+        mine = rows[rows[column] == value]
+        panel_title(chart, value, mine.iloc[0])
+        draw_board_bars(chart, mine, names)
+        if values.index(value) % across:
+            chart.set_yticklabels([])
 
 
 def draw_board_bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
@@ -548,7 +555,8 @@ def draw_risk(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Fi
             matcher, mixture = cells[number]
             mine = rows[(rows["matcher"] == matcher) & (rows["mixture"] == mixture)]
             head = matcher if mixture == AS_DRAWN else f"{matcher}, {mixture}"
-            chart.set_title(f"{head}\n{_counts(mine)}")
+            counts = mine.drop_duplicates("rejector")[["n", "answered"]].drop_duplicates().to_numpy().tolist()
+            chart.set_title(f"{head}\n{'; '.join(f'n {n}, {answered} answered' for n, answered in counts)}")
             _risk_lines(chart, mine, rejectors)
             chart.set_xlim(0.0, 1.0)
             chart.set_xticks(HALVES)
@@ -556,12 +564,6 @@ def draw_risk(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Fi
             chart.grid(visible=True, color=FAINT, lw=0.6)
             label_outer(chart, number, columns, len(cells), "risk\n(share of accepted)")
     return figure_of(charts[0][0])
-
-
-def _counts(mine: pd.DataFrame) -> str:
-    """Return the number of queries and answers of a panel, of each line where they differ."""
-    found = mine.drop_duplicates("rejector")[["n", "answered"]].drop_duplicates().to_numpy().tolist()
-    return "; ".join(f"n {n}, {answered} answered" for n, answered in found)
 
 
 def _risk_lines(chart: Axes, mine: pd.DataFrame, rejectors: Sequence[str]) -> None:

@@ -6,7 +6,6 @@ Each function writes a .svg or .png; `shown` are the matchers in the order of th
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
@@ -31,7 +30,7 @@ from sasgeo_bench.leaderboard.plots import (
     draw_bar_panels,
     draw_line,
     dress_share,
-    label_outer,
+    each_panel,
     line_keys,
     look_of,
     panel_title,
@@ -271,7 +270,10 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
     first figure counts, of the suites of the track that all of these matchers were asked.
     """
     rows = []
-    mine = {name: _counted(scores[name]) for name in shown if name in scores}
+    mine = {}
+    for name in (name for name in shown if name in scores):
+        parts = [part[is_counted(part)] for _, part in scores[name].groupby(["suite", "track"], sort=False)]
+        mine[name] = pd.concat(parts, ignore_index=True) if parts else scores[name]
     groups = {key for one in mine.values() for key in zip(one["track"], one["prior_group"], strict=True)}
     for track, prior_group in sorted(groups):
         some = {
@@ -287,12 +289,6 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
             rows.append((suites, track, prior_group, name, *found, *_costs_of(table, name, track)))
     columns = ["suites", "track", "prior_group", "matcher", *_Figure._fields, *COSTS.values()]
     return pd.DataFrame(rows, columns=columns)
-
-
-def _counted(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows that the first figure of each suite counts, of places that are on the map."""
-    parts = [part[is_counted(part)] for _, part in frame.groupby(["suite", "track"], sort=False)]
-    return pd.concat(parts, ignore_index=True) if parts else frame
 
 
 def _of_most(frames: Scores) -> tuple[dict[str, pd.DataFrame], set[str]]:
@@ -345,36 +341,24 @@ def draw_ablation(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     draw_bar_panels(path, rows, shown, "pool", pools, title=title, note=note)
 
 
-@contextmanager
 def _suite_panels(
-    path: Path, rows: pd.DataFrame, names: Sequence[str], *, title: str, note: str, below: str, label: str
-) -> Iterator[Iterator[tuple[Axes, pd.DataFrame]]]:
-    """Yield the axes and rows of each suite on a page of shares, with a line for each matcher."""
-    first, suites = rows.iloc[0], sorted(set(rows["suite"]))
-    down, across = panels_across(len(suites))
+    path: Path, rows: pd.DataFrame, names: Sequence[str], label: str, *, title: str, note: str, below: str
+) -> Iterator[tuple[Axes, pd.DataFrame]]:
+    """Yield the panel and rows of each suite on a page of shares, with a line for each matcher."""
+    first = rows.iloc[0]
     about = BoardPage(
         title=f"{title}: {first['track']}, {prior_words(str(first['prior_group']))}",
         note=f"{note} {_STRESS} {_MOST_ASKED}",
         below=below,
-        rows=down,
-        columns=across,
         keys=line_keys(names),
     )
-
-    def dressed(charts: list[list[Axes]]) -> Iterator[tuple[Axes, pd.DataFrame]]:
-        """Yield the panel and rows of each suite; set its title and axis when the caller has drawn."""
-        for number, chart in panels(charts, len(suites)):
-            mine = rows[rows["suite"] == suites[number]]
-            part = mine["stratum"].iloc[0]
-            panel_title(chart, suites[number] + ("" if part == "all" else f" {part}"), mine.iloc[0])
-            yield chart, mine
-            chart.set_ylim(-0.02, 1.04)
-            chart.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
-            chart.grid(visible=True, axis="y", color=FAINT, lw=0.6)
-            label_outer(chart, number, across, len(suites), label)
-
-    with page(path, about) as charts:
-        yield dressed(charts)
+    for chart, suite in each_panel(path, sorted(set(rows["suite"])), about, label):
+        mine = rows[rows["suite"] == suite]
+        part = mine["stratum"].iloc[0]
+        panel_title(chart, suite + ("" if part == "all" else f" {part}"), mine.iloc[0])
+        dress_share(chart)
+        chart.set_ylim(-0.02, 1.04)
+        yield chart, mine
 
 
 def draw_recall(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
@@ -384,13 +368,11 @@ def draw_recall(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     what = "the right candidate" if is_retrieval else f"a pose within {FIX_M:g} m, whatever the heading,"
     note = f"Share of queries with {what} among the first K of the answer; ties count in every order. {INTERVALS}"
     below, label = "K (poses of an answer, best first)", "recall@K (share of queries)"
-    with _suite_panels(path, rows, names, title="Recall against K", note=note, below=below, label=label) as charts:
-        for chart, mine in charts:
-            ticks_across(chart, steps, 0.75, 1.35 * steps[-1])
-            for at, name in enumerate(names):
-                line_of = mine[mine["matcher"] == name].sort_values("k")
-                places = dodged(line_of["k"].to_numpy(float), at, len(names), by=0.025)
-                draw_line(chart, line_of, places, at)
+    for chart, mine in _suite_panels(path, rows, names, label, title="Recall against K", note=note, below=below):
+        ticks_across(chart, steps, 0.75, 1.35 * steps[-1])
+        for at, name in enumerate(names):
+            line_of = mine[mine["matcher"] == name].sort_values("k")
+            draw_line(chart, line_of, dodged(line_of["k"].to_numpy(float), at, len(names), by=0.025), at)
 
 
 def draw_errors(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
@@ -401,12 +383,11 @@ def draw_errors(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         f"Dashed: {FIX_M:g} m, beyond which a fix is false; bars there: 95 % intervals as on the board (within_25m)."
     )
     title, below, label = "Distribution of errors", "position error (m)", "share of queries\nwithin that error"
-    with _suite_panels(path, rows, names, title=title, note=note, below=below, label=label) as charts:
-        for chart, mine in charts:
-            ticks_across(chart, [0.1, 1.0, 10.0, 100.0, 1000.0], LEAST_ERROR_M, MOST_ERROR_M)
-            chart.axvline(FIX_M, color="#999999", lw=0.8, ls="--")
-            for at, name in enumerate(names):
-                _error_line(chart, mine[mine["matcher"] == name], at, len(names))
+    for chart, mine in _suite_panels(path, rows, names, label, title=title, note=note, below=below):
+        ticks_across(chart, [0.1, 1.0, 10.0, 100.0, 1000.0], LEAST_ERROR_M, MOST_ERROR_M)
+        chart.axvline(FIX_M, color="#999999", lw=0.8, ls="--")
+        for at, name in enumerate(names):
+            _error_line(chart, mine[mine["matcher"] == name], at, len(names))
 
 
 def _error_line(chart: Axes, mine: pd.DataFrame, number: int, count: int) -> None:
@@ -423,7 +404,6 @@ def draw_costs(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """Draw the cost of a query against that of a false fix, from `cost_frame`: a panel for each matcher."""
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     first = rows.iloc[0]
-    down, across = panels_across(len(names))
     about = BoardPage(
         title=f"Cost of a query: {ALL_SUITES}, {first['track']}, {prior_words(str(first['prior_group']))}",
         note=(
@@ -434,21 +414,17 @@ def draw_costs(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             "them."
         ),
         below="C: cost of a false fix (places without a fix)",
-        rows=down,
-        columns=across,
         keys=line_keys(rejectors, has_marks=False),
     )
     high = 1.25 * max(float(rows["withhold_all"].max()), float(rows["cost"].quantile(0.9)))
-    with page(path, about) as charts:
-        for number, chart in panels(charts, len(names)):
-            mine = rows[rows["matcher"] == names[number]]
-            counts = ", ".join(f"{count:g}" for count in sorted(set(mine["n"])))
-            chart.set_title(f"{names[number]}\nn {counts}")
-            _cost_lines(chart, mine, rejectors)
-            ticks_across(chart, [1.0, *COST_RATIOS], float(mine["ratio"].min()), float(mine["ratio"].max()))
-            chart.set_ylim(0.0, high)
-            chart.grid(visible=True, color=FAINT, lw=0.6)
-            label_outer(chart, number, across, len(names), "mean cost of a query\n(places without a fix)")
+    for chart, name in each_panel(path, names, about, "mean cost of a query\n(places without a fix)"):
+        mine = rows[rows["matcher"] == name]
+        counts = ", ".join(f"{count:g}" for count in sorted(set(mine["n"])))
+        chart.set_title(f"{name}\nn {counts}")
+        _cost_lines(chart, mine, rejectors)
+        ticks_across(chart, [1.0, *COST_RATIOS], float(mine["ratio"].min()), float(mine["ratio"].max()))
+        chart.set_ylim(0.0, high)
+        chart.grid(visible=True, color=FAINT, lw=0.6)
 
 
 def _cost_lines(chart: Axes, mine: pd.DataFrame, rejectors: Sequence[str]) -> None:
@@ -467,7 +443,8 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     Those of `shown` have a look each; of the others, who are grey, those on the front have their name beside them.
     """
     names = those_there(rows, shown)
-    first = rows.iloc[0]
+    first, others = rows.iloc[0], len(rows) - len(names)
+    grey = f" Grey points: {counted(others, 'more matcher')}, named where on the front." if others else ""
     axes = [(name, label) for name, label in _PRICES.items() if np.isfinite(rows[name].to_numpy(float)).any()]
     about = BoardPage(
         title=f"Success against cost: {first['track']}, {prior_words(str(first['prior_group']))}",
@@ -476,7 +453,7 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             f"{counted(int(first['blocks']), 'block')}. Upright bars: 95 % intervals; level bars: from the median "
             "latency to the 95th percentile, all suites of the track. Grey line: the front, where no other matcher is "
             "both cheaper and "
-            f"better.{_others(rows, names)}{_left_out(rows)}"
+            f"better.{grey}{_left_out(rows)}"
         ),
         below="",
         columns=len(axes),
@@ -499,12 +476,6 @@ _PRICES: Final = {
     "latency_s": "latency of an answer (s), median to 95th percentile",
     "map_kb_per_km2": "map and index (kB for each km2)",
 }
-
-
-def _others(rows: pd.DataFrame, names: Sequence[str]) -> str:
-    """Return how many are drawn in grey."""
-    count = len(rows) - len(names)
-    return f" Grey points: {counted(count, 'more matcher')}, named where on the front." if count else ""
 
 
 def _left_out(rows: pd.DataFrame) -> str:

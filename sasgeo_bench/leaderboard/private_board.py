@@ -43,26 +43,11 @@ from sasgeo_bench.scoring.metrics import FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE, name_alone
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
 from sasgeo_bench.scoring.strata import GROUP
-from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS, SealedPlace
+from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS
 from sasgeo_bench.tasks.query import TASK_VERSION
 from sasgeo_bench.tasks.task_files import TaskManifest
 
 _ALL_PRIORS: Final = "all"
-SEEDS_NOTE: Final = (
-    "The same matchers, by version and hash, on the same pipeline drawn by a private seed. The sites differ, so no "
-    "query pairs with another: draws resample blocks of ground with the queries of both seeds that lie in them. All "
-    "intervals of a matcher hold at once (95 %). Shown are the figures over all suites, and whatever is worse on the "
-    "private seed."
-)
-
-_IS_PRIVATE: Final = (
-    "Seeds: this board is of a private seed. Its figures may be published; publish none of its files, for they hold "
-    "queries, truths and answers."
-)
-_IS_PUBLIC: Final = (
-    "Seeds: the queries of this board are drawn by a public seed, which code can draw again, truths and all. No row "
-    "was held against a private one, so none is reproduced."
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,51 +165,6 @@ def result_of(figures: Sequence[SeedFigure]) -> SeedResult:
 
 def _result(verdict: SeedVerdict, why: str, figures: Sequence[SeedFigure] = ()) -> SeedResult:
     return SeedResult(verdict=verdict, why=why, figures=list(figures))
-
-
-def seed_lines(about: BoardManifest) -> list[str]:
-    """Return whether the rows of a board were compared with a private seed, and the result of each."""
-    if about.private_seed is not None:
-        return [_IS_PRIVATE]
-    seed = about.private
-    if seed is None:
-        return [_IS_PUBLIC]
-    words = f"a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}"
-    rows = [(entry.name, entry.private) for entry in about.entries]
-    return [
-        f"Seeds: rows were held against the same pipeline on {words}.",
-        *(f"{name}: {row.verdict} ({row.why})." for name, row in rows if row is not None),
-    ]
-
-
-def sealed_lines(sealed: Mapping[str, SealedPlace]) -> list[str]:
-    """Return whether the board holds the sealed places, and when they were opened: a line for those of one state.
-
-    >>> sealed_lines({name: SealedPlace(drawn_by=None, openings=[]) for name in ("porto", "monaco")})
-    ['Sealed places porto, monaco: not opened, and so not on this board.']
-    """
-    places: dict[str, list[str]] = {}
-    for place, item in sealed.items():
-        places.setdefault(_sealed_state(item), []).append(place)
-    return [
-        f"Sealed place{'s' if len(names) > 1 else ''} {', '.join(names)}: {state}." for state, names in places.items()
-    ]
-
-
-def _sealed_state(item: SealedPlace) -> str:
-    days = {one.commitment: f"{one.opened} by a seed of commitment {one.commitment[:12]}" for one in item.openings}
-    if not days:
-        return "not opened, and so not on this board"
-    first = next(iter(days))
-    if item.drawn_by is None:
-        return f"opened on {days[first]}, and not on this board"
-    if item.drawn_by == first:
-        return f"opened on {days[first]}"
-    number = list(days).index(item.drawn_by) + 1
-    return (
-        f"opened on {days[item.drawn_by]}; this is opening {number}, after {days[first]}, so the place was no "
-        "longer unseen"
-    )
 
 
 _VERSIONS: Final = {"scorer_version": SCORER_VERSION, "task_version": TASK_VERSION, "data_version": DATA_VERSION}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -21,6 +21,7 @@ from sasgeo_bench.leaderboard.cases import (
     find_cases,
     operating_rejector,
     seen_at,
+    window_around,
     words_of,
 )
 from sasgeo_bench.matching.matcher import SAME_PLACE_M, Prediction
@@ -28,7 +29,6 @@ from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.layers import read_layers
-from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.running.prediction_files import RUN, Answers, RunManifest, read_ties
 from sasgeo_bench.sasgeo.integrity import EVIDENCE
 from sasgeo_bench.scoring.controls import is_control
@@ -94,7 +94,7 @@ def facts_of(case: Case) -> dict[str, float | str]:
     if prediction is not None and status == "ok" and case.fix is None:
         status = "withheld"
     scores = [score for _, score in prediction.candidates] if prediction is not None else []
-    found: dict[str, Any] = {
+    found: dict[str, float | str | None] = {
         "status": status,
         "error_m": case.error_m,
         "score_margin": scores[0] - scores[1] if len(scores) > 1 else None,
@@ -111,16 +111,10 @@ def facts_of(case: Case) -> dict[str, float | str]:
         "map_age_years": truth.measured.get("age_years"),
         **{f"told_{name}": value for name, value in (() if prediction is None else prediction.diagnostics.items())},
     }
-    return {name: _plain(value) for name, value in found.items() if _is_told(value)}
-
-
-def _is_told(value: object) -> bool:
-    return value is not None and (isinstance(value, str) or math.isfinite(float(str(value))))
-
-
-def _plain(value: float | str) -> float | str:
-    """Return a number as JSON, rounded to meaningful digits."""
-    return value if isinstance(value, str) else float(f"{float(value):.6g}")
+    texts: dict[str, float | str] = {name: value for name, value in found.items() if isinstance(value, str)}
+    numbers = {name: float(value) for name, value in found.items() if value is not None and name not in texts}
+    rounded = {name: float(f"{value:.6g}") for name, value in numbers.items() if math.isfinite(value)}
+    return {name: (texts | rounded)[name] for name in found if name in texts or name in rounded}
 
 
 def read_picture(case: Case, task: Task) -> CasePicture:
@@ -138,6 +132,7 @@ def read_picture(case: Case, task: Task) -> CasePicture:
     row, col, rows, cols = window = _window(case, manifest.grid)
     layers, grid = read_layers(region / region_files.LAYERS, window=window), manifest.grid.window(row, col, rows, cols)
     bits = LayerBits.of(layers)
+    imagery = manifest.imagery if truth.detector == REAL else None  # that a real view was cut out of
     return CasePicture(
         title=_title(case),
         view=query.evidence,
@@ -149,19 +144,12 @@ def read_picture(case: Case, task: Task) -> CasePicture:
         at_answer=None if case.fix is None else seen_at(case.fix, query.evidence, bits, grid, manifest),
         disc=disc_of(query),
         lines=_lines(case),
-        attribution=_attribution(truth, manifest),
+        attribution=manifest.attribution if imagery is None else f"{manifest.attribution}; {imagery.attribution}",
         what=_what(case),
         region=query.region,
         picture=query.frames[-1].image().rgb if query.frames else None,
         segmented=read_segmented(segmented_file(task.root, task.manifest.queries_sha256), query.query_id),
     )
-
-
-def _attribution(truth: Truth, manifest: Manifest) -> str:
-    """Return whose data a picture shows: the map's, and the imagery's that a real view was cut out of."""
-    if truth.detector != REAL or manifest.imagery is None:
-        return manifest.attribution
-    return f"{manifest.attribution}; {manifest.imagery.attribution}"
 
 
 def _window(case: Case, grid: Grid) -> tuple[int, int, int, int]:
@@ -173,11 +161,7 @@ def _window(case: Case, grid: Grid) -> tuple[int, int, int, int]:
     places = np.array([(pose.easting_m, pose.northing_m) for pose in poses])
     span_m = float(np.ptp(places, axis=0).max()) + math.sqrt(2.0) * side_m
     half_m = max(_ROOM * span_m, _LEAST_SIDES * side_m) / 2
-    middle_m = (places.min(axis=0) + places.max(axis=0)) / 2
-    corners = grid.to_cells(middle_m + half_m * np.array([(-1.0, 1.0), (1.0, -1.0)]))
-    row, col = np.clip(corners[0], 0, [grid.rows - 1, grid.cols - 1]).tolist()
-    end_row, end_col = np.clip(corners[1] + 1, [row + 1, col + 1], [grid.rows, grid.cols]).tolist()
-    return (row, col, end_row - row, end_col - col)
+    return window_around(grid, (places.min(axis=0) + places.max(axis=0)) / 2, half_m)
 
 
 def _title(case: Case) -> str:
@@ -207,25 +191,17 @@ def _lines(case: Case) -> list[str]:
     for label, name, value in rejectors:
         taken = "" if name not in case.accepted else f", {'accepted' if case.accepted[name] else 'rejected'}"
         lines.append(f"{label}: {value:.3g}{taken}")
-    lines.append(f"unknown {case.truth.unknown_share:.2f}, changed {case.truth.changed_share:.2f}" + _alias(case))
+    alias = "" if case.truth.alias_index is None else f", alias {case.truth.alias_index:.2f}"
+    lines.append(f"unknown {case.truth.unknown_share:.2f}, changed {case.truth.changed_share:.2f}{alias}")
     diagnostics = {} if case.prediction is None else dict(case.prediction.diagnostics)
     lines += ["", "its diagnostics"] if diagnostics or rejectors else ["", "no diagnostics"]
     known = [(item.name, item.unit) for item in EVIDENCE if item.name in diagnostics]
     known += [(name, "") for name in sorted(diagnostics) if name not in {name for name, _ in known}]
-    lines += [
-        f"{_short(name)}: {diagnostics[name]:.3g}{'' if unit in {'', '1'} else f' {unit}'}" for name, unit in known
-    ]
+    for name, unit in known:  # a long name would reach into the map next to it
+        short = name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 3]}..."
+        lines.append(f"{short}: {diagnostics[name]:.3g}{'' if unit in {'', '1'} else f' {unit}'}")
     rest = len(lines) - _MOST_LINES
     return lines if rest <= 0 else [*lines[: _MOST_LINES - 1], f"and {rest + 1} more"]
-
-
-def _short(name: str) -> str:
-    """Shorten a name so that it does not reach into the map next to it."""
-    return name if len(name) <= _MOST_LETTERS else f"{name[: _MOST_LETTERS - 3]}..."
-
-
-def _alias(case: Case) -> str:
-    return "" if case.truth.alias_index is None else f", alias {case.truth.alias_index:.2f}"
 
 
 def _right_candidate(case: Case) -> str:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs, files of predictions and truths -> a scored board: the order of the steps."""
 
+import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -20,7 +21,7 @@ from sasgeo_bench.leaderboard.manifests import (
     BoardEntry,
     BoardManifest,
     BoardTask,
-    Learned,
+    MetricRecord,
     RejectorRecord,
     SeedRecord,
 )
@@ -59,6 +60,7 @@ from sasgeo_bench.scoring.entries import (
     scored_rows,
     set_apart,
 )
+from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metrics, measured
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA, protection_frame
 from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, Rule, evaluate_rejectors, rules_of
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, name_alone, with_entry_labels
@@ -70,6 +72,7 @@ from sasgeo_bench.tasks.task_files import Task, TaskManifest
 
 _M2_PER_KM2: Final = 1e6
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
+_OF_TASKS: Final = ("suite", "suite_version", *BoardTask.model_fields)  # in the order of `board.json`
 
 
 def score_board(request: ScoreRequest) -> Scored:
@@ -77,10 +80,10 @@ def score_board(request: ScoreRequest) -> Scored:
 
     Raise StoreError if predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named
     by itself answers none of the queries. Raise ConfigError if there is nothing to score, or rejectors are named
-    without a split.
+    without a split, MatchError or MetricError if a metric of another package cannot be found, or fails.
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
-    rules = rules_of(request.rejectors, request.split)
+    rules, metrics = rules_of(request.rejectors, request.split), find_metrics(request.metrics)
     failures = Failures(log_beside(request.board), is_told=False)  # reported with the board, or raised
     ranks = None
     while ranks is None:  # once more for each time that the comparison of entries fails because of some of them
@@ -92,7 +95,7 @@ def score_board(request: ScoreRequest) -> Scored:
         excluded = set_apart(entries, scores, request.split, controls)
         tasks = tuple(task.manifest for task in contest.tasks)
         on_private = hold_private(request, entries=entries, scores=scores, tasks=tasks)
-        ranks = _ranks(scores, excluded, request.draws, failures)
+        ranks = _ranks(scores, excluded, request.draws, metrics, failures)
     predictions = {item.entry.name: item.predictions for item in contest.answers}
     views = _of_rows(contest.views, scores)
     costs = _costs(entries, scores, views, contest.tasks, failures)
@@ -107,7 +110,7 @@ def score_board(request: ScoreRequest) -> Scored:
             tasks,
             records,
             private=on_private.seed,
-            cards=[rule.card for rule in rules.values()],
+            plugins=([rule.card for rule in rules.values()], [_metric_of(item) for item in metrics]),
             remarks=rejection.remarks,
             failed=failures.found,
         ),
@@ -156,14 +159,19 @@ def _contest(request: ScoreRequest, failures: Failures) -> Contest:
 
 
 def _ranks(
-    scores: Mapping[str, pd.DataFrame], excluded: Mapping[str, str], draws: int, failures: Failures
+    scores: Mapping[str, pd.DataFrame],
+    excluded: Mapping[str, str],
+    draws: int,
+    metrics: Sequence[ForeignMetric],
+    failures: Failures,
 ) -> list[pd.DataFrame] | None:
     """Return the figures of all entries together; None if one of them fails, which is noted."""
-    compare = partial(leaderboards, draws=draws, excluded=excluded)
+    frames, more = measured(metrics, scores)
+    compare = partial(leaderboards, draws=draws, excluded=excluded, more=more)
     try:
-        return compare(scores)
+        return compare(frames)
     except Exception as error:
-        if stops_all(error) or not failures.blame(scores, compare):
+        if stops_all(error) or not failures.blame(frames, compare):
             raise
     tell("scored again without those that failed")
     return None
@@ -334,11 +342,12 @@ def _record_of(
     entries: Sequence[BoardEntry],
     *,
     private: SeedRecord | None,
-    cards: Sequence[RejectorCard],
+    plugins: tuple[Sequence[RejectorCard], list[MetricRecord]],
     remarks: Sequence[str],
     failed: Mapping[str, str],
 ) -> BoardManifest:
     """Return the manifest of a board; `private` is the seed that its rows were held against, `remarks` are on fits."""
+    cards, metrics = plugins
     return BoardManifest(
         scorer_version=SCORER_VERSION,
         task_version=max((item.task_version for item in tasks), default=TASK_VERSION),
@@ -359,23 +368,22 @@ def _record_of(
         rejectors=[
             RejectorRecord(**{name: getattr(card, name) for name in RejectorRecord.model_fields}) for card in cards
         ],
+        metrics=metrics,
         remarks=list(remarks),
         elsewhere=list(request.elsewhere),
         failed=dict(failed),
         entries=list(entries),
-        tasks=[
-            BoardTask(
-                suite=item.suite,
-                suite_version=item.suite_version,
-                region=item.region,
-                map_date=item.map_date,
-                queries_sha256=item.queries_sha256,
-                map_fingerprint=item.map_fingerprint,
-                failed_pictures=item.failed_pictures,
-            )
-            for item in tasks
-        ],
+        tasks=[BoardTask(**{name: getattr(item, name) for name in _OF_TASKS}) for item in tasks],
     )
+
+
+def _metric_of(found: ForeignMetric) -> MetricRecord:
+    """Return what a board says of a metric of another package."""
+    metric = found.metric
+    least, greatest = (float(end) if math.isfinite(end) else None for end in metric.bounds)
+    words = {name: getattr(metric, name) for name in ("name", "meaning", "source", "unit", "better")}
+    tracks = list(metric.tracks)
+    return MetricRecord(**words, code=found.code, sha256=found.sha256, least=least, greatest=greatest, tracks=tracks)
 
 
 def _entry_of(entry: Entry, set_apart: str | None, on_private: OnPrivate, controls: Sequence[Verdict]) -> BoardEntry:
@@ -389,7 +397,7 @@ def _entry_of(entry: Entry, set_apart: str | None, on_private: OnPrivate, contro
         trained_on=entry.declared,
         set_apart=set_apart,
         isolation=joined(run.isolation or {} for run in entry.runs) if entry.runs else None,
-        learned=[Learned.model_validate(one) for one in entry.learned()],
+        learned=entry.learned(),
         private=on_private.rows.get(entry.name),
         failed_controls=[item.to_text() for item in failed_controls(controls, entry.name)],
     )

@@ -3,15 +3,17 @@
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Self
+from functools import partial
+from typing import Any, Final, Self, TypeVar
 
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.board_files import SCHEMAS
 from sasgeo_bench.leaderboard.manifests import BoardEntry
+from sasgeo_bench.regions.region import Provenance
 from sasgeo_bench.scoring.compare import LEAST_PLACES, RankInterval
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE, is_unranked
@@ -188,11 +190,6 @@ def sort_key(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def text_cells(*texts: str) -> tuple[Cell, ...]:
-    """Return cells of plain text."""
-    return tuple(Cell(text=str(text)) for text in texts)
-
-
 def plain_cell(value: object) -> Cell:
     """Return a cell of a text or a whole number; "-" where there is none.
 
@@ -212,6 +209,58 @@ def number_cell(value: float, unit: str = "") -> Cell:
     if math.isnan(value):
         return Cell(text="-")
     return Cell(text=f"{number_text(value)} {unit}".strip(), key=value)
+
+
+Shown = Cell | str | int | float | None
+T = TypeVar("T")
+Field = tuple[Column, Callable[[T], Shown]]  # a column, and what it shows of the thing that a line is of
+
+
+def cell_of(value: Shown) -> Cell:
+    """Return what a column shows as a cell.
+
+    >>> [cell_of(value).text for value in ("mine", 3, 0.25, math.nan, None)]
+    ['mine', '3', '0.250', '-', '-']
+    """
+    if isinstance(value, Cell):
+        return value
+    if isinstance(value, str):
+        return Cell(text=value)
+    return number_cell(value) if isinstance(value, float) else plain_cell(value)
+
+
+def table_of(
+    name: str,
+    title: str,
+    things: Iterable[T],
+    fields: Sequence[Field[T]],
+    *,
+    notes: Iterable[str] = (),
+    tone: Callable[[T], str] = lambda _: "plain",
+) -> Table:
+    """Return a table of some things, one a line; each of `fields` is a column, with what it shows of a thing."""
+    lines, tones = [], []
+    for one in things:
+        lines.append([shown(one) for _, shown in fields])
+        tones.append(tone(one))
+    return grid_of(name, title, [column for column, _ in fields], lines, notes=notes, tones=tones)
+
+
+def grid_of(
+    name: str,
+    title: str,
+    columns: Iterable[Column],
+    lines: Sequence[Sequence[Shown]],
+    *,
+    notes: Iterable[str] = (),
+    tones: Sequence[str] = (),
+) -> Table:
+    """Return a table whose lines are given as they are shown; `tones` say how they look."""
+    rows = [
+        Row(cells=tuple(map(cell_of, line)), tone=tone)
+        for line, tone in zip(lines, tones or ["plain"] * len(lines), strict=True)
+    ]
+    return Table(name=name, title=title, columns=tuple(columns), rows=tuple(rows), notes=tuple(notes))
 
 
 def p_text(p: float) -> str:
@@ -390,6 +439,7 @@ _OF_CONTRASTS: Final = {  # metrics of registered contrasts alone
     "shift": "Share of queries that are right, less that on the views of the same sites by the detector `published`: "
     "what another detector adds to the difference",
 }
+_OF_PLACES: Final = {str(line.title): str(line.description) for line in Provenance.model_fields.values()}
 MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS | _OF_CONTRASTS
 NOTE: Final = (
     "Intervals are 95 %: a bootstrap over places, then blocks, then sites ({draws} draws), never narrower than over "
@@ -438,17 +488,11 @@ def column(term: str, *, is_number: bool = True, order: str = "none", title: str
     >>> column("n").meaning
     'Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones'
     """
-    meaning = MEANINGS.get(term, _UNKNOWN)
+    meaning = MEANINGS.get(term) or _OF_PLACES.get(term, _UNKNOWN)
     return Column(term=term, name=title or term, meaning=meaning, is_number=is_number, order=order)
 
 
-def words(*terms: str) -> tuple[Column, ...]:
-    """Return columns of text.
-
-    >>> [one.is_number for one in words("matcher", "suite")]
-    [False, False]
-    """
-    return tuple(column(term, is_number=False) for term in terms)
+word: Final = partial(column, is_number=False)  # a column of text
 
 
 def prior_words(name: str) -> str:

@@ -1,35 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A leaderboard as Markdown, and as lines for a terminal; the parquet tables hold everything."""
+"""The tables of a board, listed with where they are shown, and a board as Markdown, LaTeX and lines for a terminal.
+
+A table is written by four functions: `table_text`, `table_markdown`, `table_latex`, and `table` of `parts.html`.
+"""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final, NamedTuple
 
 import pandas as pd
+import rich.table
 
 from sasgeo_bench.errors import counted, named
 from sasgeo_bench.leaderboard.board_tables import (
     Book,
+    acceptance_tables,
     contrast_table,
     control_table,
     cost_table,
     falsifier_table,
+    protection_tables,
     rejection_tables,
-    sections_of,
+    risk_tables,
+    risk_tables_by_suite,
+    scene_tables,
     seed_table,
+    step_tables,
+    suite_tables,
+    summary,
 )
-from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardManifest
-from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
+from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardManifest, MetricRecord
 from sasgeo_bench.leaderboard.tables import DAGGER, NOTE, RANKS_NOTE, TERMS, Table, text_of
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
 from sasgeo_bench.scoring.compare import Finding
 from sasgeo_bench.scoring.controls import ALPHA, Falsifier, Verdict
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.strata import ALL
+from sasgeo_bench.tasks.private_seed import SealedPlace
 from sasgeo_bench.tasks.query import SEQUENCE
 from sasgeo_bench.texts import markdown, markdown_item, tex
 
+_IS_PRIVATE: Final = (
+    "Seeds: this board is of a private seed. Its figures may be published; publish none of its files, for they hold "
+    "queries, truths and answers."
+)
+_IS_PUBLIC: Final = (
+    "Seeds: the queries of this board are drawn by a public seed, which code can draw again, truths and all. No row "
+    "was held against a private one, so none is reproduced."
+)
 _FLIGHT: Final = primary_of(SEQUENCE).name
 _NEW_STYLE: Final = "2017"  # from this year on the tags of multipolygons stand on their relations
 _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
@@ -97,17 +117,12 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
     """
     if not verdicts:
         return ["Controls: none were drawn for this board, so nothing vouches for it (a pipeline draws them)."]
-    return [*_held_lines(verdicts), *_powerless_lines(verdicts)]
-
-
-def _powerless_lines(verdicts: Sequence[Verdict]) -> Iterator[str]:
-    """Yield how many controls could not have failed."""
     idle = sum(not item.can_fail for item in verdicts)
-    if idle:
-        yield (
-            f"{counted(idle, 'control')} could not fail: {'its' if idle == 1 else 'their'} queries are so few that "
-            f"guesses are right on all of them with a probability above {ALPHA:g}."
-        )
+    powerless = (
+        f"{counted(idle, 'control')} could not fail: {'its' if idle == 1 else 'their'} queries are so few that guesses "
+        f"are right on all of them with a probability above {ALPHA:g}."
+    )
+    return [*_held_lines(verdicts), *([powerless] if idle else [])]
 
 
 def _held_lines(verdicts: Sequence[Verdict]) -> list[str]:
@@ -125,10 +140,55 @@ def _held_lines(verdicts: Sequence[Verdict]) -> list[str]:
     return [f"{head} Do not trust the rows of {', '.join(rivals)}{more}:", *lines]
 
 
+def seed_lines(about: BoardManifest) -> list[str]:
+    """Return whether the rows of a board were compared with a private seed, and the result of each."""
+    if about.private_seed is not None:
+        return [_IS_PRIVATE]
+    seed = about.private
+    if seed is None:
+        return [_IS_PUBLIC]
+    words = f"a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}"
+    rows = [(entry.name, entry.private) for entry in about.entries]
+    return [
+        f"Seeds: rows were held against the same pipeline on {words}.",
+        *(f"{name}: {row.verdict} ({row.why})." for name, row in rows if row is not None),
+    ]
+
+
+def sealed_lines(sealed: Mapping[str, SealedPlace]) -> list[str]:
+    """Return whether the board holds the sealed places, and when they were opened: a line for those of one state.
+
+    >>> sealed_lines({name: SealedPlace(drawn_by=None, openings=[]) for name in ("porto", "monaco")})
+    ['Sealed places porto, monaco: not opened, and so not on this board.']
+    """
+    places: dict[str, list[str]] = {}
+    for place, item in sealed.items():
+        places.setdefault(_sealed_state(item), []).append(place)
+    return [
+        f"Sealed place{'s' if len(names) > 1 else ''} {', '.join(names)}: {state}." for state, names in places.items()
+    ]
+
+
+def _sealed_state(item: SealedPlace) -> str:
+    days = {one.commitment: f"{one.opened} by a seed of commitment {one.commitment[:12]}" for one in item.openings}
+    if not days:
+        return "not opened, and so not on this board"
+    first = next(iter(days))
+    if item.drawn_by is None:
+        return f"opened on {days[first]}, and not on this board"
+    if item.drawn_by == first:
+        return f"opened on {days[first]}"
+    number = list(days).index(item.drawn_by) + 1
+    return (
+        f"opened on {days[item.drawn_by]}; this is opening {number}, after {days[first]}, so the place was no "
+        "longer unseen"
+    )
+
+
 def training_lines(about: BoardManifest) -> list[str]:
     """Return which rows are set apart, and which entries were trained on which places.
 
-    >>> from sasgeo_bench.leaderboard.manifests import Learned
+    >>> from sasgeo_bench.matching.cards import Learned
     >>> one = Learned(file="learned/ab.json", trained_on=["monaco", "porto"], pairs=24, asked=["clean/vaduz"])
     >>> mine = BoardEntry(name="mine", learned=[one])
     >>> training_lines(BoardManifest(scorer_version=6, entries=[mine], tasks=[]))
@@ -168,51 +228,95 @@ def segmenter_lines(about: BoardManifest) -> list[str]:
     ]
 
 
-def tables_of(
-    board: pd.DataFrame,
-    entries: Sequence[BoardEntry] = (),
-    findings: Sequence[Finding] = (),
-    falsifiers: Sequence[Falsifier] = (),
-    verdicts: Sequence[Verdict] = (),
-    others: Sequence[Table] = (),
-) -> Iterator[Table]:
-    """Yield the tables of a board in the order of its pages; those without a row are left out.
+def metric_lines(about: BoardManifest) -> list[str]:
+    """Return which metrics are of other packages, and whose code they are."""
+    return [f"{one.name}: {one.to_text()}." for one in about.metrics]
 
-    `others` are the tables of absence and of steps.
+
+# --- the tables -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Contents:
+    """What the tables of a board are made of; of what is empty there is no table.
+
+    `scores` are the scored queries, `steps` the steps of stress (`strata.steps_frame`), `ages` their names where they
+    are ages of a map (`plots.age_names`), `scenes` success by kind of place (`tables.scene_frame`), `metrics`
+    those of other packages.
     """
-    book = Book.of(board, entries)
-    suites = [
-        table
-        for section in sections_of(book)
-        for table in (
-            replace(section.table, notes=(*filter(None, (section.context,)), *section.table.notes)),
-            section.apart,
-        )
-    ]
-    found = (
-        seed_table(entries),
-        contrast_table(findings),
-        falsifier_table(falsifiers),
-        *suites,
-        *rejection_tables(board),
-        cost_table(book),
-        *others,
-        control_table(verdicts),
-    )
-    yield from (table for table in found if table is not None and table.rows)
+
+    leaderboard: pd.DataFrame
+    entries: Sequence[BoardEntry] = ()
+    scores: pd.DataFrame = field(default_factory=pd.DataFrame)
+    findings: Sequence[Finding] = ()
+    falsifiers: Sequence[Falsifier] = ()
+    verdicts: Sequence[Verdict] = ()
+    acceptance: pd.DataFrame = field(default_factory=pd.DataFrame)
+    protection: pd.DataFrame = field(default_factory=pd.DataFrame)
+    steps: pd.DataFrame = field(default_factory=pd.DataFrame)
+    ages: Mapping[tuple[Any, ...], str] = field(default_factory=dict)
+    scenes: pd.DataFrame = field(default_factory=pd.DataFrame)
+    metrics: Sequence[MetricRecord] = ()
+
+    @cached_property
+    def book(self) -> Book:
+        """Return the figures that take every answer, by entry and queries."""
+        return Book.of(self.leaderboard, self.entries, self.scores, metrics=self.metrics)
 
 
-def board_markdown(board: pd.DataFrame, about: BoardManifest, **more: Any) -> str:  # noqa: ANN401 - see tables_of
-    """Return the board as a document; arguments as of `tables_of`."""
-    tables = list(tables_of(board, about.entries, **more))
+class TableKind(NamedTuple):
+    """Tables of one kind: where they are shown, and what makes them."""
+
+    name: str
+    shown: str
+    make: Callable[[Contents], Iterable[Table]]
+
+
+TERMINAL: Final = "terminal"
+MARKDOWN: Final = "leaderboard.md"
+LATEX: Final = "leaderboard.tex"
+TABLES: Final = (  # of a whole board, in the order in which any outlet shows them
+    TableKind("summary", "terminal index.html", lambda of: summary(of.book)),
+    TableKind("seeds", "leaderboard.md leaderboard.tex index.html", lambda of: [seed_table(of.entries)]),
+    TableKind("contrasts", "terminal leaderboard.md leaderboard.tex", lambda of: [contrast_table(of.findings)]),
+    TableKind("falsifiers", "leaderboard.md", lambda of: [falsifier_table(of.falsifiers)]),
+    TableKind("suites", "leaderboard.md leaderboard.tex", lambda of: suite_tables(of.book)),
+    TableKind("kinds", "kinds-of-place.html", lambda of: scene_tables(of.scenes, of.book)),
+    TableKind("risk", "terminal rejection.html", lambda of: risk_tables(of.leaderboard)),
+    TableKind("risk by suite", "rejection.html", lambda of: risk_tables_by_suite(of.leaderboard)),
+    TableKind(
+        "rejection", "leaderboard.md leaderboard.tex rejection.html", lambda of: rejection_tables(of.leaderboard)
+    ),
+    TableKind("costs", "leaderboard.md leaderboard.tex matchers.html", lambda of: [cost_table(of.book)]),
+    TableKind("acceptance", "leaderboard.md rejection.html", lambda of: acceptance_tables(of.acceptance)),
+    TableKind("protection", "rejection.html", lambda of: protection_tables(of.protection)),
+    TableKind("steps", "leaderboard.md", lambda of: step_tables(of.steps, of.ages)),
+    TableKind("controls", "leaderboard.md leaderboard.tex method.html", lambda of: [control_table(of.verdicts)]),
+)
+
+
+def tables_of(of: Contents, outlet: str) -> dict[str, tuple[Table, ...]]:
+    """Return the tables that an outlet shows, by their kind."""
+    return {kind.name: tuple(kind.make(of)) for kind in TABLES if outlet in kind.shown.split()}
+
+
+def rows_of(of: Contents, outlet: str) -> list[Table]:
+    """Return the tables that an outlet shows, without those that have no row."""
+    return [table for tables in tables_of(of, outlet).values() for table in tables if table.rows]
+
+
+def board_markdown(about: BoardManifest, of: Contents) -> str:
+    """Return the board as a document."""
+    tables = rows_of(of, MARKDOWN)
     lines = [
-        *control_lines(more.get("verdicts", ())),
+        *control_lines(of.verdicts),
         *seed_lines(about),
         *sealed_lines(about.sealed),
         *map_lines(about),
-        *warnings_of(board),
+        *warnings_of(of.leaderboard),
         *training_lines(about),
         *segmenter_lines(about),
+        *metric_lines(about),
         *(f"Failed, and not on this board: {name}: {why}" for name, why in about.failed.items()),
     ]
     columns = {column.term: column.meaning for table in tables for column in table.columns}
@@ -226,7 +330,7 @@ def board_markdown(board: pd.DataFrame, about: BoardManifest, **more: Any) -> st
             "",
             *(f"- {markdown_item(line)}" for line in lines),
             "",
-            *(line for table in tables for line in _section(table)),
+            *(line for table in tables for line in table_markdown(table)),
             "## How to read",
             "",
             *(f"- **{markdown(term)}**: {meaning}." for term, meaning in (columns | TERMS).items()),
@@ -235,15 +339,21 @@ def board_markdown(board: pd.DataFrame, about: BoardManifest, **more: Any) -> st
     )
 
 
-def _section(table: Table) -> Iterator[str]:
+def table_text(table: Table) -> rich.table.Table:
+    """Return a table for a terminal."""
+    shown = rich.table.Table(*(column.name for column in table.columns), box=None, pad_edge=False)
+    for row in table.rows:
+        shown.add_row(*map(text_of, row.cells))
+    return shown
+
+
+def table_markdown(table: Table) -> Iterator[str]:
+    """Yield the lines of a table with its title and notes."""
     yield from (f"## {markdown(table.title)}", "")
     yield from markdown_table(
         [column.name for column in table.columns], [map(text_of, row.cells) for row in table.rows]
     )
-    yield ""
-    for note in table.notes:
-        yield from (f"- {markdown_item(note)}",)
-    yield from ("",) if table.notes else ()
+    yield from ("", *(f"- {markdown_item(note)}" for note in table.notes), *([""] if table.notes else []))
 
 
 def markdown_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
@@ -266,15 +376,14 @@ _HEAD: Final = (
 )
 
 
-def board_latex(board: pd.DataFrame, about: BoardManifest, **more: Any) -> str:  # noqa: ANN401 - see tables_of
-    """Return the tables of a board for a paper, which needs the package booktabs; arguments as of `text.tables_of`."""
+def board_latex(about: BoardManifest, of: Contents) -> str:
+    """Return the tables of a board for a paper, which needs the package booktabs."""
     head = f"% {tex(about.made_by or '?')}, scorer version {about.scorer_version}; {ATTRIBUTION}"
-    tables = tables_of(board, about.entries, **more)
-    return "\n".join((head, *_HEAD, *(line for table in tables for line in _lines(table)))) + "\n"
+    return "\n".join((head, *_HEAD, *(line for table in rows_of(of, LATEX) for line in table_latex(table)))) + "\n"
 
 
-def _lines(table: Table) -> Iterator[str]:
-    """Yield one table; its label is its name."""
+def table_latex(table: Table) -> Iterator[str]:
+    """Yield the lines of a table; its label is its name."""
     rows = [" & ".join(tex(text_of(cell)) for cell in row.cells) + r" \\" for row in table.rows]
     dagger = f" {tex(DAGGER)} Wilson's interval over sites." if any(tex(DAGGER) in row for row in rows) else ""
     yield r"\begin{table}"

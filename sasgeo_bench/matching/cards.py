@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Strict
 
-from sasgeo_bench.config import parse_toml
+from sasgeo_bench import config
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.paths import given_path, plain_file, read_bounded
@@ -79,7 +79,7 @@ def read_card_file(path: Path) -> Card:
     if len(read) > _MOST_BYTES:
         raise StoreError(f"{path} has more than {_MOST_BYTES} bytes: {noun}")
     try:
-        return parse_toml(text, Card, source=str(path))
+        return config.parse_toml(text, Card, source=str(path))
     except ConfigError as error:
         raise ConfigError(f"{error}: correct it there ({_EXAMPLE})") from error
 
@@ -108,6 +108,15 @@ class TrainingRecord(Record):
     file: str | None
     trained_on: Names
     pairs: int
+
+
+class Learned(config.Record):
+    """A training by the runner: the file that was learned, if any, and the tasks that were asked under it."""
+
+    file: str | None
+    trained_on: list[str]
+    pairs: int
+    asked: list[str]
 
 
 def learned_path(run: Path, training_sha256: str) -> Path:

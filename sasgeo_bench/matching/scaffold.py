@@ -10,11 +10,21 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugins import CARD_FILE, KINDS, MATCHERS, SEGMENTERS, SUITES, TRACKERS, shipped_names
+from sasgeo_bench.files.plugins import (
+    CARD_FILE,
+    KINDS,
+    MATCHERS,
+    NAME,
+    PERTURBATIONS,
+    SEGMENTERS,
+    SUITES,
+    TRACKERS,
+    shipped_names,
+)
 from sasgeo_bench.matching.submission import EXAMPLE
+from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
-_NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
 _LONGEST: Final = 60
 # Modules that a package of this name would hide: of Python, of this package and its imports, and of common tools.
 _TAKEN: Final = frozenset(
@@ -186,6 +196,8 @@ class {cls}:
         rows, cols = evidence.shape
         hidden = rng.permutation(rows) < round(self.share * rows)
         return hide(evidence, np.broadcast_to(hidden[:, None], (rows, cols)))
+'''
+_CHANGE: Final = '''\
 
 
 def change(variant: Variant, evidence: Evidence, rng: np.random.Generator) -> Evidence:
@@ -211,6 +223,57 @@ SUITE = PlainSuite(
     change=change,
 )
 '''
+
+_PERTURBATION: Final = '''\
+"""The perturbation {name}: here is where your stress goes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from sasgeo_bench import Evidence, check_ranges, hide
+
+
+@dataclass(frozen=True)
+class {cls}:
+    """Hides whole rows of the view. At strength 0 it changes no cell, and all chance comes from `rng`."""
+
+    share: float
+
+    def __post_init__(self) -> None:
+        """Refuse a share out of range."""
+        check_ranges(self, share=(0.0, 1.0))
+
+    def __call__(self, evidence: Evidence, rng: np.random.Generator) -> Evidence:
+        """Return the view with some rows unknown."""
+        rows, cols = evidence.shape
+        hidden = rng.permutation(rows) < round(self.share * rows)
+        return hide(evidence, np.broadcast_to(hidden[:, None], (rows, cols)))
+'''
+
+_STRESS: Final = '''\
+"""The suite {name}: the perturbation {cls} at a ladder of strengths."""
+
+import numpy as np
+from sasgeo_bench import VIEW_CELLS, Evidence, PlainSuite, SuiteCard, Variant, controls, ladder
+
+from {module}.perturbation import {cls}
+'''
+
+_STRESS_TEST: Final = '''\
+"""The suite keeps to what every suite keeps to."""
+
+from sasgeo_bench import check_suite
+
+
+def test_it_conforms():
+    faults = [check for check in check_suite("{module}.suite:SUITE") if check.outcome == "fail"]
+    assert not faults, faults
+'''
+
+_SUITE_POINT: Final = """
+[project.entry-points."sasgeo_bench.suites"]
+{name} = "{module}.suite:SUITE"
+"""
 
 _TRACKER: Final = '''\
 """The tracker {name}: here is where your method goes."""
@@ -340,6 +403,23 @@ def _readme(place: str, *, words: str = _WORDS, commands: str = "", about: str =
     return _README % {"place": place, "words": words, "commands": commands, "about": about}
 
 
+_PERTURBATION_README: Final = """\
+# {title}
+
+A perturbation for sasgeo-bench, and a suite that draws queries under it.
+
+```bash
+pip install -e .
+sasgeo-bench check {name}
+sasgeo-bench make-queries --suite {name} --regions town-riverside --n 2
+sasgeo-bench inspect {name}/town-riverside --rows 6
+```
+
+The stress is in `src/{module}/perturbation.py`; say in the card of the suite (`src/{module}/suite.py`) what should
+differ before you run anything.
+"""
+
+
 class Package(NamedTuple):
     """Templates of a new package of one kind."""
 
@@ -384,7 +464,7 @@ sasgeo-bench run --matcher {name} --tasks out/tasks/flight-clean/town-grid
     "segmenter": Package(SEGMENTERS, _SEGMENTER, _readme("segmenter.py")),
     "suite": Package(
         SUITES,
-        _SUITE,
+        _SUITE + _CHANGE,
         _readme(
             "suite.py",
             words="""\
@@ -398,6 +478,17 @@ sasgeo-bench inspect {name}/town-riverside --rows 6
         ),
         attribute="SUITE",
         taken={"suite": EVERY_SUITE},
+    ),
+    "perturbation": Package(
+        PERTURBATIONS,
+        _PERTURBATION,
+        _PERTURBATION_README,
+        others={
+            "pyproject.toml": _PYPROJECT.replace("\n[tool.", f"{_SUITE_POINT}\n[tool."),
+            "src/{module}/suite.py": _STRESS + _CHANGE,
+            "tests/test_suite.py": _STRESS_TEST,
+        },
+        taken={"perturbation": SHIPPED, "suite": EVERY_SUITE},
     ),
 }
 
@@ -446,7 +537,7 @@ def files_of(package: Package, name: str) -> dict[str, str]:
 def _check_name(kind: str, name: str, package: Package) -> None:
     """Raise `ConfigError` if a new plugin cannot have a name."""
     module = name.replace("-", "_")
-    if not _NAME.fullmatch(name):
+    if not NAME.fullmatch(name):
         raise ConfigError(
             f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, a letter first, as in "
             f"my-{kind}; got {name!r}"

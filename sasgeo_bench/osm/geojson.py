@@ -193,7 +193,7 @@ def _is_lonlat(crs: Any) -> bool:  # noqa: ANN401 - what a file holds
     return _WGS84.fullmatch(str(name)) is not None
 
 
-def _properties(feature: Any) -> Mapping[str, Any]:  # noqa: ANN401 - what a file holds
+def _properties(feature: object) -> Mapping[str, object]:
     return (feature.get("properties") if isinstance(feature, dict) else None) or {}
 
 
@@ -224,7 +224,7 @@ def _fault(shape: shapely.Geometry) -> str:
     return "" if is_across and is_up else f"its bounds {shape.bounds} are no longitudes and latitudes"
 
 
-def tags_of(feature: Mapping[str, Any]) -> dict[str, str]:
+def tags_of(feature: object) -> dict[str, str]:
     """Return the tags of a feature, from properties, and from what they hold of further tags.
 
     osmtogeojson has an object `tags`, ogr2ogr a text `other_tags` ("key"=>"value" or JSON); own properties come first.
@@ -235,14 +235,13 @@ def tags_of(feature: Mapping[str, Any]) -> dict[str, str]:
     >>> tags_of({"properties": {"bridge": False, "layer": -1.0, "name": "", "other_tags": '"highway"=>"path"'}})
     {'highway': 'path', 'bridge': 'no', 'layer': '-1'}
     """
-    properties = feature.get("properties") or {}
-    found: dict[str, str] = {}
+    properties, found = _properties(feature), dict[str, str]()
     for name in _MORE_TAGS:
         found |= _texts(_parsed(properties.get(name)))
     return found | _texts({key: value for key, value in properties.items() if key not in _NO_TAGS})
 
 
-def _parsed(value: Any) -> Mapping[str, Any]:  # noqa: ANN401 - any JSON
+def _parsed(value: object) -> Mapping[str, object]:
     """Return tags from an object, or a text of JSON or of PostgreSQL's hstore."""
     if isinstance(value, str) and value.lstrip().startswith("{"):
         try:
@@ -258,11 +257,11 @@ def _unescaped(text: str) -> str:
     return re.sub(r"\\(.)", r"\1", text)
 
 
-def _texts(values: Mapping[str, Any]) -> dict[str, str]:
+def _texts(values: Mapping[str, object]) -> dict[str, str]:
     return {key: text for key, value in values.items() if (text := _text(key, value))}
 
 
-def _text(key: str, value: Any) -> str:  # noqa: ANN401 - any JSON
+def _text(key: str, value: object) -> str:
     """Return a value as a mapper writes it; empty for none."""
     if isinstance(value, bool):
         return "yes" if value else "no"
@@ -289,7 +288,7 @@ class Identity(NamedTuple):
     osm_id: int
 
 
-def identity_of(feature: Mapping[str, Any], *, is_ogr: bool = False) -> Identity | None:
+def identity_of(feature: Mapping[str, object], *, is_ogr: bool = False) -> Identity | None:
     """Return which object of OpenStreetMap a feature is, or None if it does not say so.
 
     Read are `osm_id` with `osm_type`, `osm_way_id` (ogr2ogr), `id` or `@id` with a type (`_TYPES`), and "way/7" in
@@ -302,7 +301,7 @@ def identity_of(feature: Mapping[str, Any], *, is_ogr: bool = False) -> Identity
     >>> identity_of({"properties": {"osm_id": "13", "osm_type": "way"}})
     Identity(is_relation=False, osm_id=13)
     """
-    properties = feature.get("properties") or {}
+    properties = _properties(feature)
     said = (str(properties.get(name)).lower() for name in _TYPES)
     kind = next((_OBJECTS[each] for each in said if each in _OBJECTS), "")
     for value in (*(properties.get(name) for name in ("@id", "@osmId", "id")), feature.get("id")):
@@ -321,11 +320,12 @@ def identity_of(feature: Mapping[str, Any], *, is_ogr: bool = False) -> Identity
     return None
 
 
-def _kind_of(feature: Mapping[str, Any]) -> str:
-    return str((feature.get("geometry") or {}).get("type"))
+def _kind_of(feature: Mapping[str, object]) -> str:
+    geometry = feature.get("geometry")
+    return str(geometry.get("type") if isinstance(geometry, dict) else None)
 
 
-def _whole(value: Any) -> int | None:  # noqa: ANN401 - any JSON
+def _whole(value: object) -> int | None:
     """Return an id of at most 62 bits, also of a text or a float; None if it is none."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return None

@@ -9,7 +9,7 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from threading import Event, Thread
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self
 from urllib.parse import urlsplit
 
 from pydantic import (
@@ -81,11 +81,10 @@ class Extract(Document):
     also: Annotated[tuple[ExtractPart, ...], Field(strict=False)] = ()
 
     @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _as_written(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
         """Leave out `format`, `tags` and `also` of an OSM file: such regions keep the hash of older versions."""
-        fields: dict[str, Any] = write(self)
         newer = ("format", "tags", "also") if self.format == "osm" else ()
-        return {name: value for name, value in fields.items() if name not in newer}
+        return {name: value for name, value in handler(self).items() if name not in newer}
 
     @model_validator(mode="after")
     def _has_only_keys_of_its_format(self) -> Self:

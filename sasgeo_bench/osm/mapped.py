@@ -93,7 +93,9 @@ def _links(lines: Geometries, mapped: shapely.Geometry, edge: shapely.Geometry) 
     places, count = np.unique(np.concatenate((begins, ends)), axis=0, return_counts=True)
     single = {tuple(place) for place in places[count == 1].tolist()}
     loose_begins, loose_ends = (
-        np.array([tip for tip in tips.tolist() if tuple(tip) in single and _is_within(tip, mapped)]).reshape(-1, 2)
+        np.array([tip for tip in tips.tolist() if tuple(tip) in single and shapely.contains_xy(mapped, *tip)]).reshape(
+            -1, 2
+        )
         for tips in (begins, ends)
     )
     tips = np.concatenate((loose_ends, loose_begins))
@@ -125,10 +127,6 @@ def _beyond(link: shapely.Geometry) -> shapely.Geometry:
     """Lengthen a line to the edge a little: it must divide the ground, and rounding may stop it short."""
     start, end = shapely.get_coordinates(link)
     return shapely.LineString([start, end + (end - start) * (_OFFSET_M / max(link.length, _OFFSET_M))])
-
-
-def _is_within(place: Sequence[float], mapped: shapely.Geometry) -> bool:
-    return bool(shapely.contains_xy(mapped, *place))
 
 
 def _length_in(faces: Geometries, points: Floats, length_m: Floats) -> Floats:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import check_registered
+from sasgeo_bench.files.plugins import METRICS, check_registered, code_of
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
 from sasgeo_bench.leaderboard.build import drawings, make_board
 from sasgeo_bench.leaderboard.manifests import PackManifest
@@ -43,25 +43,21 @@ class Stored:
     packed: Packed
 
     def to_text(self) -> str:
-        """Return one line with the size, the bytes of a prediction, and what was left out."""
+        """Return one line with the size and the bytes of a prediction."""
         size = self.packed
         each = size.prediction_bytes / max(size.predictions, 1)
-        left_out = f"; left out: {size.dropped}" if size.dropped else ""
         return (
             f"{self.folder}: {size.total_bytes / 1e6:.2f} MB, of these {size.prediction_bytes / 1e6:.2f} MB for "
-            f"{counted(size.predictions, 'prediction')} ({each:.0f} bytes each){left_out}"
+            f"{counted(size.predictions, 'prediction')} ({each:.0f} bytes each)"
         )
 
 
-def pack_board(
-    scored: Scored, request: ScoreRequest, folder: Path, *, lacks: str = "", most_bytes: int = MOST_BYTES
-) -> Stored:
+def pack_board(scored: Scored, request: ScoreRequest, folder: Path, *, most_bytes: int = MOST_BYTES) -> Stored:
     """Store a board that was just written in a folder, replacing older results there.
 
-    `lacks` states what the stored results that were scored had left out already; `most_bytes` limits all files
-    together. Raise `ConfigError` if a contestant is a file of predictions, whose author is unknown, or if the board is
-    of a private seed; `StoreError` if it would be too large or cannot be written, and older results then stay as they
-    were.
+    `most_bytes` limits all files together. Raise `ConfigError` if a contestant is a file of predictions, whose author
+    is unknown, or if the board is of a private seed; `StoreError` if it would be too large or cannot be written, and
+    older results then stay as they were.
     """
     submitted = next((entry.name for entry in scored.entries if not entry.runs), None)
     if submitted is not None:
@@ -76,7 +72,6 @@ def pack_board(
         tasks=tasks,
         runs=runs,
         settings=_settings_of(request, list(runs)),
-        lacks=lacks,
         most_bytes=most_bytes,
     )
     return Stored(folder=folder, packed=packed)
@@ -180,14 +175,12 @@ def score_all(request: ScoreRequest, *, has_cases: bool = True, results: Path | 
     if results is not None:
         _check_whole(request)
         check_results(results / request.board.name, request.board)
-    kept = stored_among(request.predictions)
     with laid_out(request) as laid:
         # they need what was fitted for every entry
         extras = drawings(request, has_cases=has_cases) if request.stored is None else ()
         scored = make_board(laid, extras)
         if results is not None:
-            lacks = "" if kept is None else read_pack(kept).dropped
-            tell(pack_board(scored, laid, results / laid.board.name, lacks=lacks).to_text())
+            tell(pack_board(scored, laid, results / laid.board.name).to_text())
         return scored
 
 
@@ -223,6 +216,12 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
     with scratch_folder("answers") as folder:
         found = unpack(stored, folder)
         others = [path for path in request.predictions if path != stored]
+        kept = read_board_manifest(stored)
+        named = {":".join(code_of(spec, METRICS)) for spec in request.metrics}
+        lost = [one.code for one in kept.metrics if one.code not in named]
+        if lost:
+            flags = " ".join(f"--metric {one}" for one in lost)
+            tell(f"{stored} has metrics of other packages, which are left out here: {flags} adds them")
         with _attributed(stored, found.root):
             yield replace(
                 request,
@@ -230,7 +229,7 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
                 tasks=found.tasks,
                 root=found.root,
                 truth=found.root / "truth",
-                kept=read_board_manifest(stored),
+                kept=kept,
             )
 
 

@@ -10,7 +10,7 @@ import re
 import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, get_args
 
@@ -92,20 +92,21 @@ _OLD_FILES: Final = (  # of results that list none
     *(*BOARD_FILES, f"{LEADERBOARD}.csv.gz", *FIGURE_FILES, *PICTURE_FILES),
     *(PACK, RUNS, *(f"{name}.parquet" for name in TABLES), f"{FORMER_PREDICTIONS}/*.parquet", f"{FORMER_LEARNED}/*"),
 )
-MOST_BYTES: Final = 24_000_000  # of flights each view has an answer of its own, with a covariance
+MOST_BYTES: Final = 12_000_000  # of flights each view has an answer of its own, with a covariance
 _LEVEL: Final = 19
 _PAGE_BYTES: Final = 2**28  # one page for each column: zstd finds what is alike in the answers of all matchers
 _TEXTS: Final = (  # columns of short texts that come again
     *("query_id", "track", "suite", "part", "region", "prior_group", "status", "message", MATCHER, "about", LEARNED),
     *("diagnostics.key_value.key", "measured.key_value.key"),
 )
-# Nearly all bits of these are noise, and only their first bytes are alike: split into bytes they are a tenth smaller.
-_SPLIT: Final = ("candidates.list.element.score", "latency_s")
+# Of these only the first bytes are alike: split into bytes they are a tenth smaller.
+_NOISY: Final = (
+    *(f"candidates.list.element.{name}" for name in ("easting_m", "northing_m", "score")),
+    *("latency_s", "confidence", "covariance.list.element"),
+)
 _MADE_AGAIN: Final = (".csv", ".tex")  # of a board: the same tables for other programs; `answers` are stored anyway
 _MEND: Final = "fetch the results again"
 _AGAIN: Final = "make the queries again"
-_AND: Final = "; "
-_NO_HEADINGS: Final = "heading and scale of all poses of an answer but the first: no figure reads them"
 
 
 def is_pack(folder: Path) -> bool:
@@ -316,12 +317,11 @@ class StoredRun:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Packed:
-    """Result of writing: bytes in all, bytes and number of predictions, and what was left out to be small."""
+    """Result of writing: bytes in all, bytes and number of predictions."""
 
     total_bytes: int
     prediction_bytes: int
     predictions: int
-    dropped: str = ""
 
 
 def write_pack(
@@ -331,16 +331,14 @@ def write_pack(
     tasks: Sequence[Task],
     runs: Mapping[str, Sequence[StoredRun]],
     settings: PackManifest,
-    lacks: str = "",
     most_bytes: int = MOST_BYTES,
 ) -> Packed:
     """Store a board with what it was made of, whole or not at all; older results in `folder` are replaced.
 
     `tasks` are all that were scored and `runs` those of each contestant, in the order they were read. `settings` lack
-    what is known when the files are written. `lacks` states
-    what the stored results it was made of had left out already. If the files would exceed `most_bytes`, heading and
-    scale of all poses of an answer but the first are left out. Raise `StoreError` if the result is still too large, the
-    folder holds something else, or a file cannot be read or written; what was there before stays as it was.
+    what is known when the files are written. Raise `StoreError` if the files would exceed
+    `most_bytes`, the folder holds something else, or a file cannot be read or written; what was there before stays as
+    it was.
     """
     check_replaced(folder)
     folder = resolve_link(folder)
@@ -349,12 +347,9 @@ def write_pack(
             _copy_tables(board, scratch)
             _write_tasks(scratch, tasks)
             _write_runs(scratch, runs)
-            for dropped in dict.fromkeys((lacks, _with(lacks, _NO_HEADINGS))):
-                found = _write_predictions(scratch, runs, is_lean=dropped != lacks)
-                _write_settings(scratch, settings, dropped)
-                total = sum(path.stat().st_size for path in scratch.rglob("*") if path.is_file())
-                if total <= most_bytes:
-                    break
+            found = _write_predictions(scratch, runs)
+            _write_settings(scratch, settings)
+            total = sum(path.stat().st_size for path in scratch.rglob("*") if path.is_file())
             _check_size(folder, total, found, most_bytes)
     except SasgeoError:
         raise
@@ -364,7 +359,7 @@ def write_pack(
             "rights; results that were there are as they were"
         ) from error
     count = sum(len(run.predictions) for listed in runs.values() for run in listed)
-    return Packed(total_bytes=total, prediction_bytes=found, predictions=count, dropped=dropped)
+    return Packed(total_bytes=total, prediction_bytes=found, predictions=count)
 
 
 def _copy_tables(board: Path, folder: Path) -> None:
@@ -381,14 +376,9 @@ def _copy_tables(board: Path, folder: Path) -> None:
             shutil.copyfile(source, folder / name)
 
 
-def _with(dropped: str, more: str) -> str:
-    """Add an item to what was left out, each once."""
-    return _AND.join(dict.fromkeys(filter(None, (*dropped.split(_AND), more))))
-
-
-def _write_settings(folder: Path, settings: PackManifest, dropped: str) -> None:
+def _write_settings(folder: Path, settings: PackManifest) -> None:
     files = hashes_of(folder, [name for name in list_files(folder) if name != PACK])
-    whole = settings.model_copy(update={"dropped": dropped, "files": files})
+    whole = settings.model_copy(update={"files": files})
     (folder / PACK).write_text(json_text(whole.model_dump(mode="json")), encoding="utf-8")
 
 
@@ -401,17 +391,21 @@ def _check_size(folder: Path, total: int, predictions: int, most: int) -> None:
 
 
 def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TEXTS, split: Sequence[str] = ()) -> None:
-    """Write a table as small as it gets without loss."""
+    """Write a table as small as it gets without loss; columns that it lacks are passed over."""
     write_table(
         table,
         path,
         compression_level=_LEVEL,
         data_page_size=_PAGE_BYTES,
         row_group_size=max(len(table), 1),
-        use_dictionary=[name for name in dictionary if name.partition(".")[0] in table.column_names],
-        column_encoding=dict.fromkeys(split, "BYTE_STREAM_SPLIT"),
+        use_dictionary=_there(table, dictionary),
+        column_encoding=dict.fromkeys(_there(table, split), "BYTE_STREAM_SPLIT"),
         write_statistics=False,
     )
+
+
+def _there(table: pa.Table, paths: Sequence[str]) -> list[str]:
+    return [path for path in paths if path.partition(".")[0] in table.column_names]
 
 
 def _write_tasks(folder: Path, tasks: Sequence[Task]) -> None:
@@ -470,26 +464,17 @@ def _file_of(run: RunManifest) -> str:
     return f"{run.matcher.name}-{run.hash}"
 
 
-def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *, is_lean: bool) -> int:
+def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> int:
     """Write all answers, one run after the other, and return how many bytes they are."""
     tables = []
     plain = schema_of(item for listed in runs.values() for run in listed for item in run.predictions)
     for name, listed in runs.items():
-        rows = [prediction_row(_lean(item) if is_lean else item) for run in listed for item in run.predictions]
+        rows = [prediction_row(item) for run in listed for item in run.predictions]
         table = pa.Table.from_pylist(rows, schema=plain)
         tables.append(table.append_column(MATCHER, pa.array([name] * len(rows), pa.string())))
     schema = plain.append(pa.field(MATCHER, pa.string()))
-    _write_table(pa.concat_tables([schema.empty_table(), *tables]), folder / PREDICTIONS, split=_SPLIT)
+    _write_table(pa.concat_tables([schema.empty_table(), *tables]), folder / PREDICTIONS, split=_NOISY)
     return (folder / PREDICTIONS).stat().st_size
-
-
-def _lean(item: Prediction) -> Prediction:
-    """Give all poses of an answer the heading and scale of the first."""
-    if not item.candidates:
-        return item
-    first = item.candidates[0][0]
-    poses = ((replace(pose, yaw_deg=first.yaw_deg, scale=first.scale), score) for pose, score in item.candidates)
-    return replace(item, candidates=tuple(poses))
 
 
 # --- back to folders --------------------------------------------------------------------------------------------------

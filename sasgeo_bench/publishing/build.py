@@ -32,6 +32,10 @@ from sasgeo_bench.publishing.site import site_pages
 from sasgeo_bench.publishing.site_files import (
     MOST_BYTES,
     BoardFiles,
+    Download,
+    SiteFigure,
+    SiteSource,
+    Spot,
     Written,
     draw_text,
     held,
@@ -39,13 +43,7 @@ from sasgeo_bench.publishing.site_files import (
     site_lock,
     write_site,
 )
-from sasgeo_bench.publishing.site_pages import draw_places, draw_rates, places_on_map, regions_of
-from sasgeo_bench.publishing.site_source import (
-    Download,
-    SiteFigure,
-    SiteSource,
-    Spot,
-)
+from sasgeo_bench.publishing.site_maps import draw_places, draw_rates, places_on_map, regions_of
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.intervals import DRAWS

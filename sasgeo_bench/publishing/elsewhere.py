@@ -11,13 +11,24 @@ from sasgeo_bench.files.parquet import read_table
 from sasgeo_bench.leaderboard.board_files import MEND, read_board_manifest, read_leaderboard
 from sasgeo_bench.leaderboard.board_tables import Book
 from sasgeo_bench.leaderboard.manifests import Elsewhere, ElsewhereRow
-from sasgeo_bench.leaderboard.tables import Cell, Key, Row, Table, column, figure_cell, file_stem, interval_text
+from sasgeo_bench.leaderboard.tables import (
+    Field,
+    Key,
+    Table,
+    column,
+    figure_cell,
+    file_stem,
+    interval_text,
+    table_of,
+    word,
+)
 from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.scoring.metrics import primary_of
 
 _MOST: Final = 7  # rows of one board
 _ASKED: Final = ("suite", "track", "prior_group", "asked_sha256")
 _QUERIES: Final = "queries.parquet"
+_OF_A_SHARE: Final = {"unit": "1", "interval": "", "is_applicable": True}
 
 
 def asked_elsewhere(stored: Path) -> tuple[Elsewhere, ...]:
@@ -87,13 +98,11 @@ def elsewhere_tables(listed: Sequence[Elsewhere]) -> dict[Key, tuple[Table, ...]
     found: dict[Key, tuple[Table, ...]] = {}
     for item in listed:
         key = (item.suite, item.track, item.prior_group)
-        more = {"unit": "1", "interval": "", "is_applicable": True}
-        cells = [(Cell(text=row.matcher), figure_cell({**row.model_dump(), **more})) for row in item.rows]
-        table = Table(
-            name=file_stem("elsewhere", *key, item.board),
-            title=f"The same {item.rows[0].n} queries on the board {item.board}: its best rows, not ranked here",
-            columns=(column("matcher", is_number=False), column(item.metric, order="descending")),
-            rows=tuple(Row(cells=row) for row in cells),
+        fields: tuple[Field[ElsewhereRow], ...] = (
+            (word("matcher"), lambda row: row.matcher),
+            (column(item.metric, order="descending"), lambda row: figure_cell(row.model_dump() | _OF_A_SHARE)),
         )
+        title = f"The same {item.rows[0].n} queries on the board {item.board}: its best rows, not ranked here"
+        table = table_of(file_stem("elsewhere", *key, item.board), title, item.rows, fields)
         found[key] = (*found.get(key, ()), table)
     return found

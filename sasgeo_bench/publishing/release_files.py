@@ -402,7 +402,7 @@ def write_index(folder: Path, release: Release) -> None:
         **({} if release.board is None else {"board": {"id": release.board, "queries_left_out": release.lost}}),
         "split": {"id": split.id, "title": split.title, "kind": split.kind, "buffer_m": split.buffer_m},
         "places": [place.model_dump(mode="json", exclude_defaults=True) for place in places_of(release)],
-        "maps": [_map_record(item) for item in release.maps],
+        "maps": [map_record(item) for item in release.maps],
         "tasks": [_task_record(task) for task in release.tasks],
         "truths": release.truths_said,
         "licence_url": LICENCE_URL,
@@ -421,7 +421,8 @@ def places_of(release: Release) -> list[Place]:
     return found
 
 
-def _map_record(item: ReleaseMap) -> dict[str, Any]:
+def map_record(item: ReleaseMap) -> dict[str, object]:
+    """Return what the manifest of a release says of a map."""
     about = item.manifest
     return {
         "map": item.name,
@@ -432,6 +433,7 @@ def _map_record(item: ReleaseMap) -> dict[str, Any]:
         "bounds_lonlat": list(about.bounds_lonlat),
         "fingerprint": about.fingerprint,
         "extract": {"file": about.extract.file, "sha256": about.extract.sha256},
+        **about.provenance.model_dump(),
     }
 
 

@@ -438,6 +438,7 @@ def _item(item: ReleaseMap, release: Release) -> "pystac.Item":
             "sasgeo:extract": about.extract.file,
             "sasgeo:extract_sha256": about.extract.sha256,
             "sasgeo:fingerprint": about.fingerprint,
+            **{f"sasgeo:{name}": value for name, value in about.provenance.model_dump().items()},
         },
     )
     projection = ProjectionExtension.ext(found, add_if_missing=True)

@@ -1,237 +1,54 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board as a site: tables and cards -> the text of every page. All that comes from a board is shown as text."""
 
-import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Final
+from typing import Final, NamedTuple
 from urllib.parse import urlencode
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.board_tables import (
-    Book,
-    Section,
-    acceptance_tables,
-    control_table,
-    cost_table,
-    rejection_tables,
-    risk_tables,
-    risk_tables_by_suite,
-    scene_tables,
-    sections_of,
-    seed_table,
-    summary,
-)
-from sasgeo_bench.leaderboard.cases import MEANINGS as FAILURE_MEANINGS
+from sasgeo_bench.leaderboard.board_tables import Book, sections_of
 from sasgeo_bench.leaderboard.manifests import FailedCase
-from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
-from sasgeo_bench.leaderboard.tables import (
-    MARKS,
-    MEANINGS,
-    NOTE,
-    RANKS_NOTE,
-    Bar,
-    Record,
-    Table,
-    column,
-    file_stem,
-    interval_text,
-    number_text,
-    p_text,
-    suite_card,
+from sasgeo_bench.leaderboard.tables import MARKS, MEANINGS, NOTE, RANKS_NOTE, Table, file_stem, suite_card
+from sasgeo_bench.leaderboard.text import (
+    Contents,
+    control_lines,
+    map_lines,
+    sealed_lines,
+    seed_lines,
+    segmenter_lines,
+    tables_of,
+    training_lines,
+    warnings_of,
 )
-from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.publishing.elsewhere import elsewhere_tables
-from sasgeo_bench.publishing.site_pages import OUTCOMES as ANSWER_OUTCOMES
+from sasgeo_bench.publishing.site_files import SiteFigure, SiteSource
+from sasgeo_bench.publishing.site_maps import OUTCOMES, PlaceMap, place_maps, rate_table, region_table
 from sasgeo_bench.publishing.site_pages import (
+    BETTER,
+    MatcherPage,
+    SuitePage,
+    contrasts_of,
     figures_by_kind,
     matchers_of,
-    place_maps,
-    protection_tables,
-    rate_table,
-    region_table,
     suites_of,
 )
-from sasgeo_bench.publishing.site_source import SiteSource
-from sasgeo_bench.scoring.compare import LOWER
-from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.tasks.query import SEQUENCE, base_of
 from sasgeo_bench.texts import plain
 
-_OF_SHARES: Final = frozenset({"primary", "interaction", "shift"})  # metrics whose meaning is a name that all know
-_TOLD: Final = frozenset({"decided", "cause open", "decided, small"})  # in which one is better
-OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided", "not tested")  # as on the page
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ContrastSummary:
-    """A registered contrast in plain words.
-
-    `outcome` is one of `OUTCOMES`; `because` says why neither is better, empty where one is. `ends` say who is better
-    where the difference is below 0, and where it is above, `side` on which of the two it lies.
-    `unstressed` compares both where they should not differ, empty if nothing was measured there; `bar` spans from
-    -`reach` to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
-    """
-
-    name: str
-    outcome: str
-    headline: str
-    because: str
-    difference: str
-    side: str
-    ends: tuple[str, str]
-    sentence: str
-    facts: tuple[str, ...]
-    unstressed: str
-    why: str
-    figure: str
-    bar: Bar | None
-    least: float
-    reach: float
-
-
-def contrasts_of(source: SiteSource) -> tuple[ContrastSummary, ...]:
-    """Return registered contrasts, decided ones first."""
-    records = [{str(name): value for name, value in row.items()} for row in source.board.contrasts.to_dict("records")]
-    ends = [abs(float(row[name])) for row in records for name in ("lo", "hi", "difference")]
-    reach = max((end for end in ends if math.isfinite(end)), default=1.0) or 1.0
-    found = [_summary(row, source, reach) for row in records]
-    return tuple(sorted(found, key=lambda item: OUTCOMES.index(item.outcome)))
-
-
-def _summary(row: Record, source: SiteSource, reach: float) -> ContrastSummary:
-    verdict, name = str(row["verdict"]), str(row["name"])
-    falsifier = _falsifier_of(source.board.falsifiers, name)
-    outcome = str(row["outcome"])
-    contrast = next((item for item in source.registered if item.name == name), None)
-    figure = next((item.file for item in source.figures if item.file == f"{file_stem('contrast', name)}.svg"), "")
-    known = [float(row[end]) for end in ("lo", "hi", "difference")]
-    least = float(row["least"])
-    bar = None
-    if all(map(math.isfinite, known)):
-        lo, hi, at = (round(50 + 50 * value / reach, 1) for value in known)
-        bar = Bar(lo=lo, hi=hi, at=at)
-    return ContrastSummary(
-        name=name,
-        outcome=outcome,
-        headline=_headline(row, verdict, outcome),
-        because="" if outcome in _TOLD else verdict.partition(": ")[2] or verdict,
-        difference=_difference_text(row) if int(row["n"]) else "",
-        side=_side(row),
-        ends=_ends(row),
-        sentence=_sentence(row, least),
-        facts=tuple(_contrast_facts(row, source, contrast)),
-        unstressed="" if falsifier is None else _unstressed(falsifier),
-        why=source.reasons.get(name, ""),
-        figure=figure,
-        bar=bar,
-        least=0.0 if math.isnan(least) else min(50.0, round(50 * least / reach, 1)),
-        reach=reach,
-    )
-
-
-def _headline(row: Record, verdict: str, outcome: str) -> str:
-    first, second = row["first"], row["second"]
-    if outcome in _TOLD:
-        better, worse = (first, second) if verdict.startswith(f"{first} is better") else (second, first)
-        return f"{better} is better than {worse}" + verdict.partition(" is better")[2]
-    return f"{first} against {second}"
-
-
-def _ends(row: Record) -> tuple[str, str]:
-    """Return who is better where first less second is below 0, and where it is above."""
-    first, second = str(row["first"]), str(row["second"])
-    return (first, second) if row["metric"] in LOWER else (second, first)
-
-
-def _side(row: Record) -> str:
-    below, above = _ends(row)
-    return f"above 0: {above} ahead" if float(row["difference"]) >= 0 else f"below 0: {below} ahead"
-
-
-def _sentence(row: Record, least: float) -> str:
-    """Return the difference with its interval, in words that state which direction is good."""
-    if not int(row["n"]):
-        return "No query of this board counts for it."
-    values = f"{number_text(float(row['first_value']))} against {number_text(float(row['second_value']))}"
-    below, above = _ends(row)
-    metric = str(row["metric"])
-    meaning = column(metric).meaning
-    what = f"{meaning[0].lower()}{meaning[1:]}" if metric in _OF_SHARES else f"{metric} ({meaning})"
-    good = "less is better" if metric in LOWER else "more is better"
-    most = number_text(float(row["attainable"]))
-    return (
-        f"Difference {_difference_text(row)} in the {what}: {values}; {good}. Above 0 {above} is ahead, below 0 "
-        f"{below}. At most {most} could be gained. The least difference registered as one that matters is "
-        f"{number_text(least)}."
-    )
-
-
-def _difference_text(row: Record) -> str:
-    return interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
-
-
-def _falsifier_of(falsifiers: pd.DataFrame, contrast: str) -> Record | None:
-    """Return how both sides fare without the stress, all suites together: the first row of a contrast."""
-    own = falsifiers[falsifiers["contrast"] == contrast] if len(falsifiers) else falsifiers
-    return None if own.empty else {str(name): value for name, value in own.iloc[0].items()}
-
-
-def _unstressed(row: Record) -> str:
-    gained = " What it gains there is not owed to what the contrast is named for." if row["lo"] > 0 else ""
-    return (
-        f"Without the stress, where they should not differ: {_difference_text(row)}, {row['verdict'].lower()} "
-        f"(n = {row['n']}, {counted(int(row['blocks']), 'block')}).{gained}"
-    )
-
-
-def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) -> Iterator[str]:
-    p = float(row["p_holm"])
-    if not math.isnan(p):
-        yield f"adjusted p {p_text(p)} (Holm, {counted(len(source.board.contrasts), 'contrast')})"
-    yield f"n = {counted(int(row['n']), 'query', 'queries')}"
-    yield counted(int(row["blocks"]), "block")
-    yield counted(int(row["places"]), "place")
-    if 0 < row.get("countries", 0) < row["places"]:  # older boards do not count them
-        yield counted(int(row["countries"]), "country", "countries")
-    if row["metric"] == "primary":
-        yield f"right by the first alone {row['first_only']}, by the second alone {row['second_only']}"
-    detectable = float(row["detectable"])
-    if math.isinf(detectable):
-        yield "so few places cannot show any difference"
-    elif not math.isnan(detectable):
-        yield f"least difference that so many places can show {number_text(detectable)}"
-    if contrast is not None:
-        yield contrast.queries_text()
-
-
 ASSETS: Final = ("site.css", "site.js")
-MAP_ASSETS: Final = ("leaflet.css", "leaflet.js")  # as they came, with their licence
+MAP_ASSETS: Final = ("leaflet.css", "leaflet.js", "LICENSE-leaflet")  # as they came
 FAILURES: Final = (  # in the order they are shown; others follow
     *("aliased", "aged", "occluded", "absent accepted", "right but not accepted"),
     *("one of several", "also without the stress"),
 )
-_NAMES: Final = {  # pages that every site has or may have, in the order of the navigation
-    "index.html": "Board",
-    "kinds-of-place.html": "Kinds of place",
-    "suites.html": "Suites",
-    "matchers.html": "Matchers",
-    "rejection.html": "Rejection",
-    "figures.html": "Figures",
-    "map.html": "Map",
-    "failures.html": "Failures",
-    "regions.html": "Regions",
-    "ageing.html": "Ageing",
-    "method.html": "Method",
-}
 _BLANK_LINES: Final = re.compile(r"\n\s*\n+")
 _FIRM: Final = "\N{NO-BREAK SPACE}"  # within an interval no line ends
 _INTERVAL: Final = re.compile(r"\[(-?[\d.]+), (-?[\d.]+)\]")
@@ -247,101 +64,110 @@ class Group:
     cases: tuple[tuple[int, FailedCase], ...]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Site:
+    """A board as its pages show it: `tables` by page and kind, `kinds` of figures, `maps` with their scripts."""
+
+    source: SiteSource
+    book: Book
+    tables: Mapping[str, Mapping[str, tuple[Table, ...]]]
+    kinds: Mapping[str, Sequence[SiteFigure]]
+    maps: Mapping[PlaceMap, str]
+    suites: tuple[SuitePage, ...]
+    matchers: tuple[MatcherPage, ...]
+
+
+class Page(NamedTuple):
+    """A page of every site, or of one that has something for it; what else its template shows than tables."""
+
+    file: str
+    name: str
+    more: Callable[[Site], Mapping[str, object]] = lambda _: {}
+    is_there: Callable[[Site], object] = lambda _: True
+
+
 def site_pages(source: SiteSource) -> dict[str, str]:
     """Return all pages of a site with its style and script, by file name.
 
     Pages refer to other hosts only by links, and each can be read without the script.
     """
+    board = source.board
+    contents = Contents(
+        leaderboard=board.leaderboard,
+        entries=board.about.entries,
+        scores=board.scores,
+        verdicts=board.verdicts,
+        acceptance=board.acceptance,
+        protection=board.protection,
+        scenes=source.scenes,
+        metrics=board.about.metrics,
+    )
+    site = Site(
+        source=source,
+        book=contents.book,
+        tables={page.file: tables_of(contents, page.file) for page in PAGES},
+        kinds=figures_by_kind(source.figures),
+        maps=place_maps(source),
+        suites=suites_of(source, contents.book),
+        matchers=matchers_of(source, contents.book),
+    )
+    there = [page for page in PAGES if page.is_there(site)]
     templates = environment()
-    book = Book.of(source.board.leaderboard, source.board.about.entries, source.board.scores)
-    maps = place_maps(source)
-    scenes = tuple(scene_tables(source.scenes, book)) if len(source.scenes) else ()
-    rejection = rejection_tables(source.board.leaderboard)
-    protection = protection_tables(source.board.protection)
-    acceptance = acceptance_tables(source.board.acceptance)
-    optional = {
-        "kinds-of-place.html": scenes,
-        "rejection.html": rejection or protection,
-        "figures.html": source.figures,
-        "map.html": maps,
-        "failures.html": source.pictures.cases,
-    }
-    there = [name for name in _NAMES if optional.get(name, True)]
-    suites, matchers, sections = suites_of(source, book), matchers_of(source, book), sections_of(book)
-    kinds = figures_by_kind(source.figures)
-    common: dict[str, Any] = {
-        "source": source,
-        "about": source.board.about,
-        "book": book,
-        "there": there,
-        "navigation": [(name, _NAMES[name]) for name in there],
-        "note": NOTE.format(draws=source.board.about.draws or "?"),
-    }
-    special = {
-        "index.html": _index(source, book, sections),
-        "kinds-of-place.html": {"tables": scenes},
-        "suites.html": {"suites": suites},
-        "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
-        "rejection.html": {
-            "risks": (*risk_tables(source.board.leaderboard), *risk_tables_by_suite(source.board.leaderboard)),
-            "tables": rejection,
-            "acceptance": acceptance,
-            "protection": protection,
-            "kinds": kinds,
-            "filters": _filters((*rejection, *acceptance, *protection), "matcher", "rejector"),
-        },
-        "figures.html": {"kinds": kinds},
-        "map.html": {"places": list(maps), "outcomes": ANSWER_OUTCOMES, "classes": load_taxonomy().classes},
-        "failures.html": _failures(source, {place.region for place in maps}),
-        "regions.html": {"table": region_table(source)},
-        "ageing.html": {"table": rate_table(source.rates), "kinds": kinds},
-        "method.html": {
-            "controls": control_table(source.board.verdicts),
-            "learned": [*training_lines(source.board.about), *segmenter_lines(source.board.about)],
-            "meanings": MEANINGS | MARKS,
-        },
-    }
-    pages = {name: _render(templates, name, name, common | special[name]) for name in there}
-    for suite in suites:
-        pages[suite.page] = _render(templates, "suite.html", suite.page, common | {"suite": suite})
-    for matcher in matchers:
-        pages[matcher.page] = _render(templates, "matcher.html", matcher.page, common | {"matcher": matcher})
+    templates.globals.update(
+        site=site,
+        source=source,
+        about=board.about,
+        book=site.book,
+        there={page.file: page.name for page in there},
+        note=NOTE.format(draws=board.about.draws or "?"),
+    )
+    shown = {page.file: (page.file, {"tables": site.tables[page.file], **page.more(site)}) for page in there}
+    shown |= {suite.page: ("suite.html", {"suite": suite}) for suite in site.suites}
+    shown |= {matcher.page: ("matcher.html", {"matcher": matcher}) for matcher in site.matchers}
+    pages = {}
+    for name, (template, values) in shown.items():
+        text = templates.get_template(template).render(values, page=name)
+        pages[name] = _BLANK_LINES.sub("\n", _INDENTS.sub("", text)) + "\n"
     pages |= {name: templates.get_template(name).render() for name in ASSETS}
-    return pages | _map_files(templates, {place.file: script for place, script in maps.items()})
+    if site.maps:
+        vendor = resources.files("sasgeo_bench.publishing").joinpath("vendor")
+        pages |= {name: vendor.joinpath(name).read_text(encoding="utf-8") for name in MAP_ASSETS}
+        pages |= {"map.js": templates.get_template("map.js").render()}
+    return pages | {place.file: script for place, script in site.maps.items()}
 
 
-def _map_files(templates: Environment, scripts: Mapping[str, str]) -> dict[str, str]:
-    """Return what the page with the map loads; nothing for a board without one."""
-    if not scripts:
-        return {}
-    vendor = resources.files("sasgeo_bench.publishing").joinpath("vendor")
-    kept = {name: vendor.joinpath(name).read_text(encoding="utf-8") for name in (*MAP_ASSETS, "LICENSE-leaflet")}
-    return {"map.js": templates.get_template("map.js").render(), **kept, **scripts}
-
-
-def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:
+def _index(site: Site) -> dict[str, object]:
     """Return what the first page shows."""
-    controls = source.board.verdicts
-    overview = tuple(table for table in summary(book) if _has_rivals(table))
-    contrasts = contrasts_of(source)
+    source, book, about, controls = site.source, site.book, site.source.board.about, site.source.board.verdicts
+    sections, contrasts = sections_of(book), contrasts_of(source)
+    tables = site.tables["index.html"]
+    overview = tuple(table for table in tables["summary"] if sum(row.tone != "control" for row in table.rows) > 1)
     prices = {table.name.replace("summary", "price", 1) for table in overview}
+    counts = Counter(item.outcome for item in contrasts)
+    outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+    shown = "; ".join(f"{item.headline} ({item.name})" for item in contrasts if item.outcome in BETTER)
+    found = (
+        f"Of {counted(len(contrasts), 'difference')} registered before anything was run: {outcomes}. "
+        f"{f'Shown: {shown}.' if shown else 'Nobody is shown to be better than another.'}"
+    )
+    failed = [item for item in controls if not item.holds]  # the board, or rows of some entries alone
+    is_board = any(item.is_of_board for item in failed)
     return {
         "sections": sections,
-        "elsewhere": elsewhere_tables(source.board.about.elsewhere),
+        "elsewhere": elsewhere_tables(about.elsewhere),
         "words_of": {item.prior_group: item.prior for item in sections},
         "overview": overview,
         "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),
         "ranks_note": RANKS_NOTE,
         "contrasts": contrasts,
-        "found": _found_text(contrasts),
+        "found": found,
         "made_of": _made_of(book),
         "control_lines": control_lines(controls),
-        "controls_state": _controls_state(controls),
+        "controls_state": "failed" if is_board else "held" if controls and not failed else "doubtful",
         "has_controls": bool(controls),
-        "seed_line": seed_lines(source.board.about)[0],
-        "sealed_lines": sealed_lines(source.board.about.sealed),
-        "seeds": seed_table(source.board.about.entries),
-        "warnings": [*map_lines(source.board.about), *warnings_of(source.board.leaderboard)],
+        "seed_line": seed_lines(about)[0],
+        "sealed_lines": sealed_lines(about.sealed),
+        "warnings": [*map_lines(about), *warnings_of(source.board.leaderboard)],
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
         "size": _size_text(source, book),
     }
@@ -360,23 +186,20 @@ def _made_of(book: Book) -> str:
     )
 
 
-def _found_text(contrasts: Sequence[ContrastSummary]) -> str:
-    """Return in one line how many registered differences came out how, and which entries are shown to be better."""
-    counts = Counter(item.outcome for item in contrasts)
-    said = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
-    told = [f"{item.headline} ({item.name})" for item in contrasts if item.outcome in _TOLD]
-    better = f" Shown: {'; '.join(told)}." if told else " Nobody is shown to be better than another."
-    return f"Of {counted(len(contrasts), 'difference')} registered before anything was run: {said}.{better}"
+def _failures(site: Site) -> dict[str, object]:
+    """Return what the page of failures shows; those of a place with a map lead there."""
+    mapped = {place.region for place in site.maps}
 
+    def _on_map(case: FailedCase) -> str:
+        asked = {"place": base_of(case.region), "matcher": case.matcher, "suite": case.suite, "outcome": "failures"}
+        return f"map.html?{urlencode(asked | {'query': case.query_id})}"
 
-def _failures(source: SiteSource, mapped: Collection[str]) -> dict[str, Any]:
-    """Return what the page of failures shows; `mapped` are the places with a map of their queries."""
-    groups = groups_of(source.pictures.cases)
+    groups = groups_of(site.source.pictures.cases)
     numbered = {number: case for group in groups for number, case in group.cases}
     return {
         "groups": groups,
         "total": len(numbered),
-        "meanings_of": FAILURE_MEANINGS,
+        "meanings_of": OUTCOMES,
         "links": {number: _on_map(case) for number, case in numbered.items() if base_of(case.region) in mapped},
         "filters": [
             ("Matcher", "matcher", sorted({case.matcher for case in numbered.values()}), {}),
@@ -386,23 +209,47 @@ def _failures(source: SiteSource, mapped: Collection[str]) -> dict[str, Any]:
     }
 
 
-def _on_map(case: FailedCase) -> str:
-    """Return the address of a case on the map of its place."""
-    asked = {"place": base_of(case.region), "matcher": case.matcher, "suite": case.suite, "outcome": "failures"}
-    return f"map.html?{urlencode(asked | {'query': case.query_id})}"
-
-
-def _filters(tables: Sequence[Table], *terms: str) -> list[tuple[str, str, list[str], dict[str, str]]]:
-    """Return choices of the values of some columns of text, by name."""
-    found: dict[str, dict[str, None]] = {term: {} for term in terms}
-    for table in tables:
+def _rejection(site: Site) -> dict[str, object]:
+    """Return choices of the matchers and rejectors of the tables of rejection, by name."""
+    tables = site.tables["rejection.html"]
+    found: dict[str, set[str]] = {"matcher": set(), "rejector": set()}
+    for table in (*tables["rejection"], *tables["acceptance"], *tables["protection"]):
         for at, one in enumerate(table.columns):
-            found.get(one.term, {}).update(dict.fromkeys(row.cells[at].text for row in table.rows))
-    return [(term.capitalize(), term, sorted(values), {}) for term, values in found.items() if values]
+            if one.term in found:
+                found[one.term].update(row.cells[at].text for row in table.rows)
+    return {"filters": [(term.capitalize(), term, sorted(values), {}) for term, values in found.items() if values]}
 
 
-def _has_rivals(table: Table) -> bool:
-    return sum(row.tone != "control" for row in table.rows) > 1
+def _method(site: Site) -> dict[str, object]:
+    about = site.source.board.about
+    of_others = {one.name: one.to_text() for one in about.metrics}
+    of_regions = {one.term: one.meaning for one in region_table(site.source).columns}
+    return {
+        "learned": [*training_lines(about), *segmenter_lines(about)],
+        "meanings": MEANINGS | of_others | of_regions | MARKS,
+    }
+
+
+PAGES: Final = (  # in the order of the navigation
+    Page("index.html", "Board", _index),
+    Page("kinds-of-place.html", "Kinds of place", is_there=lambda site: site.tables["kinds-of-place.html"]["kinds"]),
+    Page("suites.html", "Suites"),
+    Page("matchers.html", "Matchers"),
+    Page(
+        "rejection.html",
+        "Rejection",
+        _rejection,
+        lambda site: any(site.tables["rejection.html"][kind] for kind in ("rejection", "protection")),
+    ),
+    Page("figures.html", "Figures", is_there=lambda site: site.source.figures),
+    Page(
+        "map.html", "Map", lambda _: {"outcomes": OUTCOMES, "classes": load_taxonomy().classes}, lambda site: site.maps
+    ),
+    Page("failures.html", "Failures", _failures, lambda site: site.source.pictures.cases),
+    Page("regions.html", "Regions", lambda site: {"table": region_table(site.source)}),
+    Page("ageing.html", "Ageing", lambda site: {"table": rate_table(site.source.rates)}),
+    Page("method.html", "Method", _method),
+)
 
 
 def environment() -> Environment:
@@ -421,19 +268,6 @@ def _shown(value: object) -> object:
     if not isinstance(value, str) or hasattr(value, "__html__"):
         return value
     return _INTERVAL.sub(rf"[\1,{_FIRM}\2]", plain(value))
-
-
-def _render(templates: Environment, template: str, page: str, values: Mapping[str, Any]) -> str:
-    text = templates.get_template(template).render(**values, page=page)
-    return _BLANK_LINES.sub("\n", _INDENTS.sub("", text)) + "\n"
-
-
-def _controls_state(verdicts: Sequence[Verdict]) -> str:
-    """Return the class of the page's box: what failed is the board, or rows of some entries alone."""
-    failed = [item for item in verdicts if not item.holds]
-    if any(item.is_of_board for item in failed):
-        return "failed"
-    return "held" if verdicts and not failed else "doubtful"
 
 
 def _size_text(source: SiteSource, book: Book) -> str:

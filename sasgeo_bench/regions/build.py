@@ -54,7 +54,8 @@ class BuildPlan:
     """Inputs and outputs of a build.
 
     `source` is None for an embedded town, which is made during the build; `more` are further files of the extract.
-    `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date.
+    `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date, or
+    would be but for its provenance, which `region.json` alone holds.
     `with_preview` adds a picture of the layers, which takes longer than all else of a small region.
     """
 
@@ -122,7 +123,7 @@ def plan_build(
     is_newest = extract == spec.pick(None)
     folder = out / "regions" / (spec.id if is_newest else f"{spec.id}@{extract.date.isoformat()}")
     inputs = _inputs_sha256(spec, extract, sha256_of(source) if source else "")
-    grid, is_current = spec.grid(), _is_current(folder, inputs, with_preview=with_preview)
+    grid, kept = spec.grid(), _kept(folder, inputs, with_preview=with_preview)
     return BuildPlan(
         spec=spec,
         extract=extract,
@@ -130,11 +131,11 @@ def plan_build(
         grid=grid,
         folder=folder,
         inputs_sha256=inputs,
-        is_current=is_current,
+        is_current=kept is not None and _states(kept, spec),
         more=more,
         pictures=tuple(
             check_picture(find_imagery(entry, folders=imagery_folders, extracts=extract_folders), entry, grid)
-            for entry in (() if is_current else spec.imagery)
+            for entry in (spec.imagery if kept is None else ())
         ),
         with_preview=with_preview,
     )
@@ -143,7 +144,7 @@ def plan_build(
 def _inputs_sha256(spec: RegionFile, extract: Extract, source_sha256: str) -> str:
     """Hash all inputs of a region: its file, the extract's bytes, the taxonomy, and our versions."""
     inputs = {
-        "region": spec.model_dump(mode="json", exclude={"extract"}),
+        "region": spec.model_dump(mode="json", exclude={"extract", "provenance"}),
         "extract": extract.model_dump(mode="json", exclude={"urls", "sha256"}),
         "source": source_sha256,
         "taxonomy": load_taxonomy().of_maps(),
@@ -157,17 +158,22 @@ def package_version() -> str:
     return metadata.version("sasgeo-bench")
 
 
-def _is_current(folder: Path, inputs_sha256: str, *, with_preview: bool) -> bool:
+def _kept(folder: Path, inputs_sha256: str, *, with_preview: bool) -> Manifest | None:
+    """Return the manifest of a region whose files are those that a build would write; None if they are not."""
     try:
         manifest = region_files.read_manifest(folder)
     except StoreError:
-        return False
+        return None
     sizes_hold = all(
         (folder / name).is_file() and (folder / name).stat().st_size == record.bytes
         for name, record in manifest.files.items()
     )
     is_shown = region_files.PREVIEW in manifest.files or not with_preview
-    return sizes_hold and is_shown and manifest.inputs_sha256 == inputs_sha256
+    return manifest if sizes_hold and is_shown and manifest.inputs_sha256 == inputs_sha256 else None
+
+
+def _states(manifest: Manifest, spec: RegionFile) -> bool:
+    return manifest.provenance.model_dump() == spec.provenance.model_dump()
 
 
 def build_region(plan: BuildPlan) -> Manifest:
@@ -355,8 +361,14 @@ def _write_unless_current(plan: BuildPlan, write: Callable[[Path], Manifest]) ->
     """Let `write` fill the folder of a region; return None if it is up to date, perhaps by a build we waited for."""
     try:
         with locked(plan.folder):
-            if _is_current(plan.folder, plan.inputs_sha256, with_preview=plan.with_preview):
+            kept = _kept(plan.folder, plan.inputs_sha256, with_preview=plan.with_preview)
+            if kept is not None and _states(kept, plan.spec):
                 return None
+            if kept is not None:
+                tell(f"{plan.folder.name}: its provenance alone has changed: only {region_files.MANIFEST} is written")
+                kept = kept.model_copy(update={"provenance": plan.spec.provenance})
+                region_files.write_manifest(plan.folder, kept)
+                return kept
             with fresh_folder(plan.folder) as scratch:
                 return write(scratch)
     except SasgeoError:
@@ -433,6 +445,7 @@ def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, gra
         files={},
         licence=LICENCE,
         attribution=ATTRIBUTION,
+        provenance=spec.provenance,
     )
 
 

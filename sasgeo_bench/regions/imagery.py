@@ -5,13 +5,13 @@ import datetime as dt
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field
 
-from sasgeo_bench.config import Document, Line
+from sasgeo_bench.config import Document, JsonDocument, Line
 from sasgeo_bench.errors import ImageryError, StoreError
 from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.geotiff import open_geotiff
@@ -27,13 +27,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 Metres = Annotated[float, Field(ge=0)]
 
 
-class _Record(Document):
-    """Base of JSON records: JSON has no tuples and no dates, so ordinary conversion is allowed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
-
-
-class RenderedRecord(_Record):
+class RenderedRecord(JsonDocument):
     """How a picture was rendered of a map: no photograph is in it.
 
     `map_sha256` is the hash of the inputs of the dated map that it shows, `made_by` the program.
@@ -48,11 +42,13 @@ class RenderedRecord(_Record):
     made_by: str
 
 
-class PictureRecord(_Record):
+class PictureRecord(JsonDocument):
     """One picture that the imagery was made of; `gsd_m` is its own ground resolution.
 
     A picture that was rendered has `rendered`: its file, hash and date are those of the extract that it shows.
     """
+
+    without_empty: ClassVar = frozenset({"rendered"})
 
     file: str
     sha256: str
@@ -65,12 +61,6 @@ class PictureRecord(_Record):
     gsd_m: Metres
     rendered: RenderedRecord | None = None
 
-    @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `rendered` where there is none, as regions of older versions do."""
-        fields: dict[str, Any] = write(self)
-        return fields if self.rendered else {name: value for name, value in fields.items() if name != "rendered"}
-
     def to_text(self) -> str:
         """Describe in a few words what it is."""
         if self.rendered is None:
@@ -79,7 +69,7 @@ class PictureRecord(_Record):
         return f"rendered from {self.file} of {self.date} ({look})"
 
 
-class OffsetRecord(_Record):
+class OffsetRecord(JsonDocument):
     """Measured offset of the imagery against the map: where a thing of the map is seen, less where the map has it.
 
     `east_m` and `north_m` with their 95 % intervals are of all tiles together; `residual_m` is the median distance of
@@ -103,7 +93,7 @@ class OffsetRecord(_Record):
         )
 
 
-class OrthoRecord(_Record):
+class OrthoRecord(JsonDocument):
     """The imagery of a region as `region.json` holds it: its pictures, lattice and offset against the map.
 
     `bounds_m` are west, south, east, north; `share` is the fraction of the mapped ground that it shows.
@@ -230,9 +220,9 @@ def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
     try:
         with open_geotiff(path) as whole:
             fitting = [factor for factor in whole.overviews(1) if factor * whole.res[0] <= grid.cell_size_m]
-        level: dict[str, Any] = {"overview_level": len(fitting) - 1} if fitting else {}
+        level = len(fitting) - 1 if fitting else None
         with (
-            open_geotiff(path, **level) as source,
+            open_geotiff(path, overview_level=level) as source,
             WarpedVRT(
                 source,
                 crs=source.crs,

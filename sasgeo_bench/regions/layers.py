@@ -77,7 +77,7 @@ def find_bands(path: Path, source: rasterio.io.DatasetReader) -> Bands:
         raise ImageryError(
             f"{path} has {source.count} band(s) of {source.dtypes[0]}, imagery is 8-bit red, green and blue: convert "
             "it (gdal_translate -ot Byte -scale, -expand rgb for a palette, -b for the bands, -colorinterp for their "
-            f"colours); {colours.fault or 'its bands are ' + _names(source.colorinterp)}"
+            f"colours); {colours.fault or 'its bands are ' + ', '.join(item.name for item in source.colorinterp[:8])}"
         )
     bits = source.tags(colours.rgb[0], ns="IMAGE_STRUCTURE").get("NBITS", str(_BITS))
     if bits != str(_BITS):
@@ -140,10 +140,6 @@ def _each_once(words: Sequence[str]) -> tuple[int, int, int] | None:
         return None
     red, green, blue = (words.index(item.name) + 1 for item in _COLOURS)
     return red, green, blue
-
-
-def _names(interpretation: Sequence[ColorInterp]) -> str:
-    return ", ".join(item.name for item in interpretation[:8])
 
 
 def _is_mask(source: rasterio.io.DatasetReader, band: int) -> bool:

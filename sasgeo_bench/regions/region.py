@@ -4,14 +4,14 @@
 import datetime as dt
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Self, TypeVar, cast
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field
 
-from sasgeo_bench.config import Document
+from sasgeo_bench.config import JsonDocument, Line, Record
 from sasgeo_bench.files.folders import FileRecord
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
@@ -34,14 +34,30 @@ Count = Annotated[int, Field(ge=0)]
 Value = TypeVar("Value")
 
 
-class _Record(Document):
-    """Base of JSON records: JSON has no tuples and no dates, so ordinary conversion is allowed."""
+class Provenance(Record):
+    """Lines on the origin of a place, as `[provenance]` of its region file states them.
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+    Each goes whole to `region.json`, `task.json`, `board.json`, archives and releases, and is a column of a board's
+    table of maps, as soon as it is a field here: text, a number, or None where the file states nothing.
+
+    >>> Provenance(surveyed_by="the village school").titled()
+    {'surveyed by': 'the village school'}
+    """
+
+    surveyed_by: Annotated[
+        Line | None, Field(title="surveyed by", description="Who surveyed the place, as its region file says")
+    ] = None
+
+    def titled(self) -> dict[str, str]:
+        """Return what is stated, by the titles of the lines."""
+        stated = {line.title or name: getattr(self, name) for name, line in Provenance.model_fields.items()}
+        return {title: str(value) for title, value in stated.items() if value is not None}
 
 
-class ExtractRecord(_Record):
+class ExtractRecord(JsonDocument):
     """The extract a region was built from; `also` are its further files with their SHA-256."""
+
+    without_empty: ClassVar = frozenset({"also"})
 
     file: str
     sha256: str
@@ -50,14 +66,8 @@ class ExtractRecord(_Record):
     osm_timestamp: dt.datetime | None
     also: dict[str, str] = {}
 
-    @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `also` where there is none, as regions of older versions do."""
-        fields: dict[str, Any] = write(self)
-        return fields if self.also else {name: value for name, value in fields.items() if name != "also"}
 
-
-class CoverageRecord(_Record):
+class CoverageRecord(JsonDocument):
     """The mapped area: its source, its share of the grid, and its outline as WKT in the region's CRS.
 
     `unknown_m2` is the ground removed from it, by reason (one place may have two); `cuts` counts what an extract lost
@@ -78,13 +88,15 @@ class CoverageRecord(_Record):
         return "; ".join((f"{self.share:.1%} of the grid ({self.source}){about}", *reasons))
 
 
-class Manifest(_Record):
+class Manifest(JsonDocument):
     """`region.json`: identity and provenance of a region, and the hashes of its files.
 
     `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects in and around the grid by
     reason: not visible from above, not used, repaired. `classes` are those that the map knows of: whatever is of
     another class is unknown everywhere. `imagery` is None in a region without.
     """
+
+    without_empty: ClassVar = frozenset({"imagery", "provenance"})
 
     schema_version: int
     data_version: int
@@ -113,12 +125,7 @@ class Manifest(_Record):
     licence: str
     attribution: str
     imagery: OrthoRecord | None = None
-
-    @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `imagery` where there is none, as regions of older versions do."""
-        fields: dict[str, Any] = write(self)
-        return fields if self.imagery else {name: value for name, value in fields.items() if name != "imagery"}
+    provenance: Provenance = Provenance()
 
     @property
     def grid(self) -> Grid:
@@ -228,6 +235,7 @@ class Region:
             "objects": ", ".join(f"{name} {count:,}" for name, count in about.counts.items() if count),
             "imagery": "none" if about.imagery is None else about.imagery.attribution,
             "data": about.attribution,
+            **about.provenance.titled(),
         }
         return html_facts(f"{about.title} ({about.id})", facts)
 

@@ -15,7 +15,7 @@ import shapely
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, GridError, StoreError
-from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
+from sasgeo_bench.files.folders import FileRecord, file_record, fresh_file, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import (
     CHECKED,
@@ -76,8 +76,8 @@ def _attributed(table: Table) -> Table:
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write `region.json`, the last file of a region: without it the folder is no region."""
-    text = json_text(manifest.model_dump(mode="json"))
-    (folder / MANIFEST).write_text(text, encoding="utf-8")
+    with fresh_file(folder / MANIFEST, mend="check the free space and your rights") as path:
+        path.write_text(json_text(manifest.model_dump(mode="json")), encoding="utf-8")
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -5,18 +5,11 @@ import datetime as dt
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 import pyproj
 import shapely
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    StringConstraints,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import ConfigDict, Field, StringConstraints, field_validator, model_validator
 
 from sasgeo_bench.config import Line, NamedDocument, find_document, list_documents, read_document
 from sasgeo_bench.errors import ConfigError, GridError
@@ -25,6 +18,7 @@ from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.imagery import ImageryEntry
+from sasgeo_bench.regions.region import Provenance
 
 MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
 MAX_LONGITUDE_DEG: Final = 180.0
@@ -32,11 +26,16 @@ MAX_AREA_KM2: Final = 100_000.0
 MAX_CELLS: Final = 4e9
 _EDGE_POINTS: Final = 21
 _M_PER_DEG: Final = 111_320.0
-_NEWER: Final = ("coverage_parts_lonlat", "classes", "largest_view_m", "imagery")  # keys since the first edition
 
 Scene = Literal["urban", "suburban", "industrial", "riverside", "agricultural", "alpine", "coastal", "forest"]
 Corner = Annotated[tuple[float, float], Field(strict=False)]
 Identifier = Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
+
+
+class StatedProvenance(Provenance):
+    """The table `[provenance]` of a region file: a misspelt line is refused."""
+
+    model_config = ConfigDict(extra="forbid")
 
 
 class RegionFile(NamedDocument):
@@ -59,6 +58,8 @@ class RegionFile(NamedDocument):
     (256, 256)
     """
 
+    without_empty: ClassVar = frozenset({"coverage_parts_lonlat", "classes", "largest_view_m", "imagery", "provenance"})
+
     id: Identifier
     title: Line
     scenes: Annotated[list[Scene], Field(min_length=1)]
@@ -73,13 +74,7 @@ class RegionFile(NamedDocument):
     largest_view_m: Annotated[float, Field(gt=0)] | None = None
     extract: Annotated[list[Extract], Field(min_length=1)]
     imagery: list[ImageryEntry] = []
-
-    @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out newer keys where they are not set: such regions keep the hash of older versions."""
-        fields: dict[str, Any] = write(self)
-        newer = {name for name in _NEWER if not fields.get(name)}
-        return {name: value for name, value in fields.items() if name not in newer}
+    provenance: StatedProvenance = StatedProvenance()
 
     @field_validator("cell_size_m")
     @classmethod

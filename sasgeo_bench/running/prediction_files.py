@@ -191,6 +191,12 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 ROUND: Final = "round.json"  # beside the tasks of a run, while all of it is asked again
+# Answers are scored and stored without the digits below these, which no figure shows and which are most of the bytes.
+# Powers of two: what is left out is zeros.
+STEP_M: Final = 2.0**-7
+STEP_DEG: Final = 2.0**-7
+COVARIANCE_BITS: Final = 16
+
 _MEND: Final = "write it again, or remove it where it is a part of a run"
 _MEND_ROUND: Final = "remove it and enter with --again"
 _ROWS_AT_ONCE: Final = 64
@@ -302,7 +308,10 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """Answers to queries, a row for each with the columns of `PART_SCHEMA`; `aside` counts rows that answer others."""
+    """Answers to queries, a row for each with the columns of `PART_SCHEMA`; `aside` counts rows that answer others.
+
+    They are `rounded`, so that a board scored from its stored answers is the same.
+    """
 
     table: pa.Table
     aside: int = 0
@@ -327,18 +336,18 @@ class Answers:
             aside |= {replace(tie, status="") for tie, own in zip(ties, is_own, strict=True) if not own}
             ids = [tie.query_id if own else None for tie, own in zip(ties, is_own, strict=True)]
             tables.append(_newest(table, ids, seen))
-        return cls(_joined(tables), len(aside))
+        return cls(rounded(_joined(tables)), len(aside))
 
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read all rows of a run's folder or a file, one for each id. Raise as `read_predictions` does."""
-        return cls(_joined(list(_tables_of(path))))
+        return cls(rounded(_joined(list(_tables_of(path)))))
 
     @classmethod
     def of(cls, predictions: Iterable[Prediction]) -> Self:
         """Return answers that are in memory."""
         schema = PART_SCHEMA.remove(PART_SCHEMA.get_field_index(ASKED))
-        return cls(pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=schema))
+        return cls(rounded(pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=schema)))
 
     @classmethod
     def merged(cls, parts: Sequence[Self]) -> Self:
@@ -365,6 +374,41 @@ class Answers:
         nothing = pa.array([[]] * len(self.table), PREDICTION_SCHEMA.field("candidates").type)
         at = self.table.column_names.index("candidates")
         return replace(self, table=self.table.set_column(at, "candidates", nothing))
+
+
+def rounded(answers: pa.Table) -> pa.Table:
+    """Return answers with positions to `STEP_M` and headings to `STEP_DEG`.
+
+    Covariances keep `COVARIANCE_BITS` bits, if they stay covariances. Scores, confidences and diagnostics are exact,
+    since ranks are made of them. Rounded again, answers stay as they are.
+    """
+    listed = answers["candidates"].combine_chunks()
+    poses = listed.flatten()
+    columns = {field.name: _numbers(poses.field(field.name)) for field in _CANDIDATE}
+    columns |= {name: _on_grid(columns[name], STEP_M) for name in ("easting_m", "northing_m")}
+    columns["yaw_deg"] = _on_grid(columns["yaw_deg"], STEP_DEG) % 360
+    struct = pa.StructArray.from_arrays([pa.array(values) for values in columns.values()], names=list(columns))
+    starts = pc.subtract(listed.offsets, listed.offsets[0]).cast(pa.int32())
+    new = {"candidates": pa.ListArray.from_arrays(starts, struct)}
+    if "covariance" in answers.column_names:
+        new["covariance"] = _rounded_covariances(answers["covariance"].combine_chunks())
+    for name, column in new.items():
+        answers = answers.set_column(answers.column_names.index(name), name, column)
+    return answers
+
+
+def _on_grid(values: Floats, step: float) -> Floats:
+    return np.round(values / step) * step
+
+
+def _rounded_covariances(column: pa.ListArray) -> pa.ListArray:
+    exact = _numbers(column.flatten()).reshape(-1, SIDE**2)
+    mantissa, exponent = np.frexp(exact)
+    coarse = np.ldexp(_on_grid(mantissa, 2.0**-COVARIANCE_BITS), exponent)
+    is_one = are_covariances(coarse.reshape(-1, SIDE, SIDE))
+    values = pa.array(np.where(is_one[:, np.newaxis], coarse, exact).ravel())
+    ends = np.concatenate([[0], np.cumsum(np.where(column.is_valid(), SIDE**2, 0))])
+    return pa.ListArray.from_arrays(pa.array(ends, pa.int32()), values, mask=column.is_null())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The conformance kit of suites: what every suite promises, checked on a small town."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +13,7 @@ import numpy as np
 from sasgeo_bench.errors import ConfigError, SasgeoError
 from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.progress import reporting, silent
-from sasgeo_bench.running.testing import Check, check_of
+from sasgeo_bench.running.testing import Check, check_of, tried
 from sasgeo_bench.tasks.build import check_task, make_tasks, plan_draw
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.sampling import Drawer
@@ -83,20 +83,17 @@ def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
         yield Check(name="single views", outcome="not applicable", found="queries are views of flights")
         return
     kit = _Kit(request=request, drawer=drawer, sites=tuple(sites))
-    rules: tuple[tuple[str, Callable[[], str | None]], ...] = (
-        ("the same seed, the same queries", kit.repeats),
-        ("another seed, other queries", kit.depends_on_seed),
-        ("views as their variant says", kit.keeps_size),
-        ("a falsifier sees what its control sees", kit.falsifiers_are_controls),
-        ("a stress changes something", kit.stresses),
-        ("the searched disc holds the truth", kit.priors_hold),
+    found = f"{len(kit.pairs)} queries"
+    yield from tried(
+        (
+            ("the same seed, the same queries", kit.repeats, found),
+            ("another seed, other queries", kit.depends_on_seed, found),
+            ("views as their variant says", kit.keeps_size, found),
+            ("a falsifier sees what its control sees", kit.falsifiers_are_controls, found),
+            ("a stress changes something", kit.stresses, found),
+            ("the searched disc holds the truth", kit.priors_hold, found),
+        )
     )
-    for rule, check in rules:
-        try:
-            fault = check()
-        except Exception as error:  # noqa: BLE001 - as above
-            fault = message_of(error)
-        yield check_of(rule, fault, f"{len(kit.pairs)} queries")
 
 
 class _AsControl(Shot):

@@ -29,6 +29,7 @@ from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice
 from sasgeo_bench.tasks.task_files import query_bytes
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.texts import message_of
 
 Outcome = Literal["pass", "fail", "not applicable"]
 AnyCard = TypeVar("AnyCard", MatcherCard, SegmenterCard)
@@ -58,6 +59,19 @@ def check_of(name: str, fault: str | None, found: str) -> Check:
     'pass'
     """
     return Check(name=name, outcome="fail" if fault else "pass", found=fault or found)
+
+
+def tried(rules: Iterable[tuple[str, Callable[[], str | None], str]]) -> Iterator[Check]:
+    """Yield a row for each rule: its name, what returns a fault or None, and what was found where there is none.
+
+    What code of somebody's own raises is a fault, too.
+    """
+    for name, rule, found in rules:
+        try:
+            fault = rule()
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - as said
+            fault = message_of(error)
+        yield check_of(name, fault, found)
 
 
 class NotApplicable(Exception):  # noqa: N818 - no error: the rule does not concern this plugin

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted, named
 from sasgeo_bench.files.plugins import ORACLE, shipped_names
-from sasgeo_bench.matching.cards import TrainingRecord
+from sasgeo_bench.matching.cards import Learned, TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.progress import tell
@@ -71,15 +71,19 @@ class Entry:
         """Return True if the halves of a split were answered after different training."""
         return bool(self.learned()) or (self.submission is not None and self.submission.card.is_by_half)
 
-    def learned(self) -> list[dict[str, Any]]:
+    def learned(self) -> list[Learned]:
         """Return each training by the runner once: its source, its training places and the tasks asked under it."""
-        found: dict[str, dict[str, Any]] = {}
+        found: dict[str, TrainingRecord] = {}
+        asked: dict[str, list[str]] = {}
         for run in self.runs:
             if run.learned is not None:
-                fields = run.learned.model_dump(include=set(TrainingRecord.model_fields))
-                one = found.setdefault(run.learned.key, fields | {"asked": []})
-                one["asked"].append(f"{run.suite}/{run.region}")
-        return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
+                found.setdefault(run.learned.key, run.learned)
+                asked.setdefault(run.learned.key, []).append(f"{run.suite}/{run.region}")
+        known = set(TrainingRecord.model_fields)
+        return [
+            Learned.model_validate(one.model_dump(include=known) | {"asked": sorted(asked[key])})
+            for key, one in sorted(found.items())
+        ]
 
 
 def find_entries(

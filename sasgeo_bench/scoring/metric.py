@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import pandas as pd
 
 from sasgeo_bench.scoring import cost
@@ -22,7 +23,7 @@ class Metric:
 
     name: str
     meaning: str
-    source: str
+    source: str = "original"
     unit: str = "1"
     better: Literal["higher", "lower"] = "lower"
     bounds: tuple[float, float] = (0.0, 1.0)
@@ -33,17 +34,31 @@ class Metric:
         return self.bounds[self.better == "lower"]
 
 
+def every_row(scores: pd.DataFrame) -> Bools:
+    """Return a mask of all rows."""
+    return np.ones(len(scores), dtype=bool)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MeanMetric(Metric):
     """A mean over queries or flights, printed on some tracks; matchers are ranked by the primary one.
 
-    `values` maps scored rows to one finite value for each, `counts` to a mask of the denominator, the same for every
-    matcher.
+    `values` maps scored rows (`scores.parquet`) to one number for each; of a metric of another package NaN leaves a
+    query out. `counts` maps them to a mask of the denominator, by default all. The denominator is the same for every
+    matcher: whether a query counts may depend on the query and its truth, never on the answer.
+
+    Examples
+    --------
+    >>> def near(scores):
+    ...     return (scores["position_error_m"] <= 15.0).where(scores["is_present"]).to_numpy(float)
+    >>> meaning = "Share of queries with a fix within 15 m, whatever the heading"
+    >>> MeanMetric(name="within-15m", meaning=meaning, better="higher", tracks=("localization",), values=near).worst
+    0.0
     """
 
     tracks: tuple[str, ...]
     values: Callable[[pd.DataFrame], Floats]
-    counts: Callable[[pd.DataFrame], Bools]
+    counts: Callable[[pd.DataFrame], Bools] = every_row
     is_primary: bool = False
 
 

@@ -4,6 +4,7 @@
 To add a metric, write its function and add one row to `METRICS`.
 """
 
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from typing import Any, Final
@@ -43,10 +44,6 @@ def _column(scores: pd.DataFrame, name: str) -> Floats:
     return scores[name].to_numpy(float)
 
 
-def _every(scores: pd.DataFrame) -> Bools:
-    return np.ones(len(scores), dtype=bool)
-
-
 def _is_longer(scores: pd.DataFrame, than_m: float) -> Bools:
     return (scores["length_m"] > than_m).to_numpy(bool)
 
@@ -64,8 +61,14 @@ def _off_inside(scores: pd.DataFrame) -> Floats:
 
 
 def _flight_mean(name: str, meaning: str, **more: Any) -> MeanMetric:  # noqa: ANN401 - other fields of the metric
-    fields: dict[str, Any] = {"source": "mean over flights", "values": partial(_column, name=name), "counts": _every}
-    return MeanMetric(name=name, meaning=meaning, tracks=(SEQUENCE,), **(fields | more))
+    usual = MeanMetric(
+        name=name,
+        meaning=meaning,
+        source="mean over flights",
+        tracks=(SEQUENCE,),
+        values=partial(_column, name=name),
+    )
+    return replace(usual, **more)
 
 
 _amount = partial(_flight_mean, bounds=(0.0, _INF))

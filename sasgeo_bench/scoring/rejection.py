@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Final, Self
 
 import numpy as np
 import pandas as pd
@@ -348,12 +348,12 @@ class _Fit:
         )
 
 
-def _judged(test: pd.DataFrame, fit: _Fit, predictions: Mapping[str, Prediction]) -> dict[str, Any]:
+def _judged(test: pd.DataFrame, fit: _Fit, predictions: Mapping[str, Prediction]) -> dict[str, Floats | str | bool]:
     """Return the columns that `judge` adds for some rows."""
     p_false, remark = _apply(fit.rejector, test, predictions)
     p_right = 1.0 - p_false
-    said = {"p_right": p_right, "remark": remark, "is_calibrated": fit.rejector.card.is_calibrated}
-    return {**said, **_decided(fit.known, test.assign(p_right=p_right))}
+    decided = _decided(fit.known, test.assign(p_right=p_right))
+    return {"p_right": p_right, "remark": remark, "is_calibrated": fit.rejector.card.is_calibrated, **decided}
 
 
 _NAMES: Final = ("query_id", "place", "part", "country", "block")  # of objects, which are chosen faster than texts

@@ -102,7 +102,7 @@ class SegmenterBoard:
 
 
 def write_board(
-    folder: Path, trials: Sequence[SegmenterTrial], *, draws: int = DRAWS, attrs: Mapping[str, Any] | None = None
+    folder: Path, trials: Sequence[SegmenterTrial], *, draws: int = DRAWS, attrs: Mapping[str, object] | None = None
 ) -> None:
     """Score trials and write their tables and perception profiles into a folder.
 

@@ -45,12 +45,14 @@ def leaderboard(
     excluded: Collection[str] = (),
     done: Callable[[], None] = lambda: None,
     parts: Parts = strata,
+    more: Sequence[MeanMetric] = (),
 ) -> pd.DataFrame:
     """Return the metrics of every matcher on every suite, track, prior group and stratum, with the columns of `Row`.
 
     `scored` holds rows of `score.score_task` by matcher, all for the same queries. Matchers in `excluded` have no rank
     and are no rivals; controls never are. `done` is called after each suite, track and prior group. `parts` yields the
-    strata of the queries of one of these. Raise MetricError if two matchers were scored on different queries.
+    strata of the queries of one of these; `more` are metrics beside those of every board. Raise MetricError if two
+    matchers were scored on different queries.
     """
     if not scored:
         return FIGURE_SCHEMA.empty()
@@ -66,12 +68,14 @@ def leaderboard(
     def rows_of(key: tuple[str, str, str]) -> Iterator[Row]:
         """Yield the rows of one group, whose queries alone are sorted and copied."""
         frames = {name: frame.iloc[orders[name][places[key]]] for name, frame in scored.items()}
-        return _rows_of_group(GroupKey(*key), frames, draws, unranked, parts)
+        return _rows_of_group(GroupKey(*key), frames, draws, unranked, parts, more)
 
     return FIGURE_SCHEMA.frame(in_threads(rows_of, sorted(places), done))
 
 
-def leaderboards(scored: Mapping[str, pd.DataFrame], *, draws: int, excluded: Collection[str]) -> list[pd.DataFrame]:
+def leaderboards(
+    scored: Mapping[str, pd.DataFrame], *, draws: int, excluded: Collection[str], more: Sequence[MeanMetric] = ()
+) -> list[pd.DataFrame]:
     """Return the `leaderboard` of each set of suites that the same matchers were asked: in most cases one.
 
     Arguments as of `leaderboard`, but matchers may lack suites.
@@ -79,7 +83,7 @@ def leaderboards(scored: Mapping[str, pd.DataFrame], *, draws: int, excluded: Co
     keys = {key for frame in scored.values() for key in frame[[*GROUP]].itertuples(index=False)}
     progress.begin(INTERVALS, len(keys))
     return [
-        leaderboard(some, draws=draws, excluded=excluded, done=lambda: progress.advance(INTERVALS, 1))
+        leaderboard(some, draws=draws, excluded=excluded, done=lambda: progress.advance(INTERVALS, 1), more=more)
         for some in asked_alike(scored)
     ]
 
@@ -118,7 +122,13 @@ class _Group:
     errors: dict[str, Floats]
 
     @classmethod
-    def of(cls, key: GroupKey, frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
+    def of(
+        cls,
+        key: GroupKey,
+        frames: Mapping[str, pd.DataFrame],
+        unranked: Collection[str],
+        metrics: Sequence[MeanMetric],
+    ) -> Self:
         """Return the columns of some matchers' rows; `unranked` matchers are no rivals."""
         first = next(iter(frames.values()))
         columns = dict.fromkeys(quantile.column for quantile in quantiles_of(key.track))
@@ -138,7 +148,7 @@ class _Group:
             sites=codes[2],
             is_answered=stacked(lambda frame: frame["is_answered"].to_numpy(bool)),
             is_missing=stacked(lambda frame: (frame["status"] == MISSING).to_numpy(bool)),
-            measured={metric.name: stacked(metric.values) for metric in means_of(key.track)},
+            measured={metric.name: stacked(metric.values) for metric in metrics},
             errors={name: stacked(partial(_floats, name=name)) for name in columns},
         )
 
@@ -180,7 +190,12 @@ class _Cell:
 
 
 def _rows_of_group(
-    key: GroupKey, frames: dict[str, pd.DataFrame], draws: int, unranked: Collection[str], parts: Parts
+    key: GroupKey,
+    frames: dict[str, pd.DataFrame],
+    draws: int,
+    unranked: Collection[str],
+    parts: Parts,
+    more: Sequence[MeanMetric],
 ) -> Iterator[Row]:
     able = {name: frame for name, frame in frames.items() if not (frame["status"] == NOT_APPLICABLE).all()}
     for name, frame in frames.items():
@@ -189,17 +204,20 @@ def _rows_of_group(
             yield row_key.row(primary_of(key.track), bare(math.nan), is_applicable=False)
     if not able:
         return
-    group = _Group.of(key, able, unranked)
-    counted = {metric.name: metric.counts(group.first) for metric in means_of(key.track)}
+    ours, others = means_of(key.track), [metric for metric in more if key.track in metric.tracks]
+    group = _Group.of(key, able, unranked, (*ours, *others))
+    counted = {metric.name: metric.counts(group.first) for metric in (*ours, *others)}
     for stratum, inside in parts(group.first):
-        by_count: dict[bytes, list[MeanMetric]] = {}
-        for metric in means_of(key.track):
-            mask = inside & counted[metric.name]
-            if mask.any():
-                by_count.setdefault(mask.tobytes(), []).append(metric)
-        for key_of_mask, metrics in by_count.items():
-            chosen = np.flatnonzero(np.frombuffer(key_of_mask, dtype=bool))
-            yield from _mean_rows(_Cell(group=group, stratum=stratum, chosen=chosen, draws=draws), metrics)
+        # Those of other packages by themselves: not a digit of ours may depend on them
+        for asked in (ours, others):
+            by_count: dict[bytes, list[MeanMetric]] = {}
+            for metric in asked:
+                mask = inside & counted[metric.name]
+                if mask.any():
+                    by_count.setdefault(mask.tobytes(), []).append(metric)
+            for key_of_mask, metrics in by_count.items():
+                chosen = np.flatnonzero(np.frombuffer(key_of_mask, dtype=bool))
+                yield from _mean_rows(_Cell(group=group, stratum=stratum, chosen=chosen, draws=draws), metrics)
 
 
 def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:

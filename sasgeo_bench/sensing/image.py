@@ -248,7 +248,7 @@ STORED: Final = 0  # for bytes that do not stay
 LABELLED: Final = ".labelled"  # suffix of a file that holds one labelled image
 
 
-def pack_parts(magic: bytes, head: Mapping[str, Any], body: bytes, *, level: int = QUICK) -> bytes:
+def pack_parts(magic: bytes, head: Mapping[str, object], body: bytes, *, level: int = QUICK) -> bytes:
     """Return a head and a body as bytes that begin with `magic`.
 
     >>> data = pack_parts(b"DEMO", {"count": 3}, b"abc")
@@ -260,7 +260,7 @@ def pack_parts(magic: bytes, head: Mapping[str, Any], body: bytes, *, level: int
     return magic + _HEAD.pack(len(text)) + text + zlib.compress(body, level=level)
 
 
-def split_parts(magic: bytes, data: bytes, what: str) -> tuple[dict[str, Any], bytes]:
+def split_parts(magic: bytes, data: bytes, what: str) -> tuple[dict[str, object], bytes]:
     """Return the head and the compressed body of bytes; raise `ImageError` if they are not what `pack_parts` writes."""
     fault = f"these bytes are not {what}, or their head is damaged: make it again"
     start = len(magic) + _HEAD.size
@@ -340,7 +340,7 @@ def labelled_from(data: bytes) -> LabelledImage:
     return LabelledImage(image=image, classes=tuple(classes), labels=labels, place=place)
 
 
-def _head(image: AerialImage) -> dict[str, Any]:
+def _head(image: AerialImage) -> dict[str, object]:
     return {
         "camera": asdict(image.camera),
         "height_sigma_m": float(image.height_sigma_m),
@@ -354,9 +354,8 @@ def _camera(head: Mapping[str, Any]) -> Camera:
     """Return the camera of a head; raise `ImageError` if it has none, or one of too many pixels."""
     try:
         given = dict(head["camera"])
-        inner = given["intrinsics"].items()
-        lens: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in inner}
-        intrinsics = Intrinsics(**lens)
+        lens = dict(given["intrinsics"])
+        intrinsics = Intrinsics(**lens | {name: tuple(lens[name]) for name in lens if isinstance(lens[name], list)})
         camera = Camera(**{**given, "intrinsics": intrinsics, "rotation": tuple(given["rotation"])})
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ImageError("the camera of an image's head is damaged: make it again") from error

@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,17 +208,14 @@ def _shifted_bytes(counts: NDArray[np.int64], share: float) -> NDArray[np.uint8]
     return same
 
 
-def _read_head(head: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[int, int]]:
+def _read_head(head: Mapping[str, object]) -> tuple[tuple[str, ...], tuple[int, int]]:
     """Read classes, rows and columns; raise `ImageError` if they are none, or too many."""
     classes, shape = head.get("classes"), head.get("shape")
-    is_sound = (
-        isinstance(classes, list)
-        and all(isinstance(name, str) for name in classes)
-        and isinstance(shape, list)
+    if not (isinstance(classes, list) and all(isinstance(name, str) for name in classes)) or not (
+        isinstance(shape, list)
         and len(shape) == 2  # rows and columns
         and all(type(side) is int and side > 0 for side in shape)
-    )
-    if not is_sound or classes is None or shape is None:
+    ):
         raise ImageError("the head of a segmentation is damaged: make it again")
     rows, cols = shape
     if len(classes) > MOST_CLASSES or len(classes) * rows * cols > MOST_VALUES:

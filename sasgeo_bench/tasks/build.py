@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -274,13 +274,15 @@ def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site
         by_map.setdefault(drawer.map_of(job), []).append(job)
     name = drawer.suite.card.name
     # With the seed anyone could draw the truths again, so it stays with them.
-    hidden: dict[str, Any] = {**seed_record(request.seed), "count": request.count, "maps": len(by_map)}
-    hidden["request_sha256"] = _request_sha256(request)
-    if request.choice.profile is not None:
-        hidden["profile"] = request.choice.profile.model_dump(mode="json", exclude={"classes"})
+    profile = request.choice.profile
+    hidden = TruthManifest.model_validate(
+        seed_record(request.seed)
+        | {"count": request.count, "maps": len(by_map), "request_sha256": _request_sha256(request)}
+        | ({} if profile is None else {"profile": profile.model_dump(mode="json", exclude={"classes"})})
+    )
     for region, own in sorted(by_map.items()):
         origin = _origin(request, drawer, region, sites, own)
-        made = put_task(drawer.drawn(own), origin, TruthManifest(**hidden), out=request.out)
+        made = put_task(drawer.drawn(own), origin, hidden, out=request.out)
         drawn = f"{counted(made.manifest.queries, 'query', 'queries')} at {counted(len(sites), 'site')}"
         tell(f"{name} on {region}: {drawn} in {made.folder}")
         yield made
@@ -347,6 +349,7 @@ def _origin(
         map_date=state.date.isoformat(),
         map_fingerprint=manifest.fingerprint,
         map_inputs_sha256=manifest.inputs_sha256,
+        provenance=manifest.provenance,
         split=spec.id,
         split_sha256=hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),
         sites=len(sites),

@@ -161,7 +161,7 @@ def encode_webp(rgb: NDArray[np.uint8], *, most_bytes: int = MOST_PICTURE_BYTES)
     )
 
 
-def frame_row(frame: Frame) -> dict[str, Any]:
+def frame_row(frame: Frame) -> dict[str, object]:
     """Return a frame as a row of `FRAME`."""
     lens = frame.camera.intrinsics
     return {
@@ -189,7 +189,7 @@ def frame_of(row: Mapping[str, Any]) -> Frame:
     return Frame(picture=row["picture"], camera=camera, **{name: row[name] for name in _SIGMAS})
 
 
-def label_row(query_id: str, number: int, item: FrameLabels) -> dict[str, Any]:
+def label_row(query_id: str, number: int, item: FrameLabels) -> dict[str, object]:
     """Return the labels of one frame as a row of `LABEL_SCHEMA`."""
     return {
         "query_id": query_id,
@@ -201,11 +201,6 @@ def label_row(query_id: str, number: int, item: FrameLabels) -> dict[str, Any]:
     }
 
 
-def label_of(row: Mapping[str, Any]) -> FrameLabels:
-    """Return the labels of a row of `LABEL_SCHEMA`."""
-    return FrameLabels(classes=tuple(row["classes"]), rows=row["rows"], cols=row["cols"], packed=row["labels"])
-
-
 def read_labels(truth_folder: Path) -> Iterator[tuple[str, int, FrameLabels]]:
     """Yield query id, number of the frame and its labels, one at a time, in the order of the queries.
 
@@ -214,4 +209,7 @@ def read_labels(truth_folder: Path) -> Iterator[tuple[str, int, FrameLabels]]:
     with open_table(truth_folder / LABELS, mend="make the queries again", is_whole=False) as source:
         for batch in source.iter_batches(batch_size=1):
             row = batch.to_pylist()[0]
-            yield row["query_id"], row["frame"], label_of(row)
+            labels = FrameLabels(
+                classes=tuple(row["classes"]), rows=row["rows"], cols=row["cols"], packed=row["labels"]
+            )
+            yield row["query_id"], row["frame"], labels

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterable, Mapping, MutableMapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -83,7 +83,7 @@ class PrivateSeed:
 Seed = int | PrivateSeed
 
 
-def seed_record(seed: Seed) -> dict[str, Any]:
+def seed_record(seed: Seed) -> dict[str, int | dict[str, str | int]]:
     """Return what files hold of a seed: a public one itself, of a private one the commitment and its bits."""
     if isinstance(seed, int):
         return {"seed": seed}

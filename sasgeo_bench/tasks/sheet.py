@@ -4,9 +4,10 @@
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from textwrap import wrap
-from typing import Any, Final, Self
+from typing import Final, NamedTuple, Self
 
 import cv2
 import numpy as np
@@ -368,7 +369,6 @@ PRIOR: Final = "#1f5fbf"
 LOST: Final = "#7b2fa0"
 OFF_MAP: Final = "#ffc928"
 COPY: Final = "#00796b"
-_FLIGHT_COLUMNS: Final = ("query_id", "increment", "prior_easting_m", "prior_northing_m", "prior_radius_m")
 _PANEL_INCHES: Final = 3.4
 _ONE_INCHES: Final = 8.0  # of a flight that is drawn alone
 _DRAWN_CELLS: Final = 900
@@ -418,6 +418,16 @@ class FlightPanel:
         return int(np.argmax(np.hypot(*np.diff(self.place_m, axis=0).T))) + 1
 
 
+class _View(NamedTuple):
+    """Columns of a view of a flight."""
+
+    query_id: str
+    increment: list[float] | None
+    prior_easting_m: float
+    prior_northing_m: float
+    prior_radius_m: float | None  # None: it may be anywhere
+
+
 def flight_panels(task: Task, *, count: int = 12, flight: str | None = None) -> tuple[FlightPanel, ...]:
     """Choose the flights of as many whole sites as `count` panels hold, one site at least; a site's control first.
 
@@ -442,14 +452,14 @@ def flight_panels(task: Task, *, count: int = 12, flight: str | None = None) -> 
                 f"{task.folder} holds no flight {flight!r}: it has {counted(len(truths), 'flight')}, as "
                 f"{', '.join(list(truths)[:3])}"
             )
-    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in chosen}
-    for batch in read_batches(task.folder / QUERIES, _FLIGHT_COLUMNS):
+    views: dict[str, list[_View]] = {name: [] for name in chosen}
+    for batch in read_batches(task.folder / QUERIES, _View._fields):
         for row in batch.to_pylist():
-            rows.get(flight_id(row["query_id"]), []).append(row)
+            views.get(flight_id(row["query_id"]), []).append(_View(**row))
     for name in chosen:
-        if [row["query_id"] for row in rows[name]] != [truth.query_id for truth in truths[name]]:
+        if [view.query_id for view in views[name]] != [truth.query_id for truth in truths[name]]:
             raise StoreError(f"{task.truth} does not hold the truths of {task.folder}: make the queries again")
-    return tuple(_flight_panel(name, truths[name], rows[name]) for name in chosen)
+    return tuple(_flight_panel(name, truths[name], views[name]) for name in chosen)
 
 
 def _of_sites(truths: Mapping[str, Sequence[Truth]], count: int) -> list[str]:
@@ -465,11 +475,10 @@ def _order(truth: Truth) -> tuple[int, float, str, str]:
     return (_RANK[truth.role], truth.strength, truth.kind, truth.detector)
 
 
-def _flight_panel(name: str, truths: Sequence[Truth], rows: Sequence[Mapping[str, Any]]) -> FlightPanel:
+def _flight_panel(name: str, truths: Sequence[Truth], views: Sequence[_View]) -> FlightPanel:
     poses = [truth.pose for truth in truths if truth.pose is not None]
     place_m = np.array([(pose.easting_m, pose.northing_m) for pose in poses])
-    first = rows[0]
-    disc = tuple(first[f"prior_{item}_m"] for item in ("easting", "northing", "radius"))
+    _, _, easting_m, northing_m, radius_m = views[0]
     return FlightPanel(
         flight=name,
         truth=truths[0],
@@ -479,8 +488,8 @@ def _flight_panel(name: str, truths: Sequence[Truth], rows: Sequence[Mapping[str
         is_on_map=np.array([truth.is_present for truth in truths]),
         copy_m=place_m
         + np.array([[truth.measured.get(name, np.nan) for name in (TWIN_EAST, TWIN_NORTH)] for truth in truths]),
-        increments=np.array([row["increment"] or [np.nan] * 3 for row in rows[1:]], dtype=np.float64).reshape(-1, 3),
-        prior_m=None if disc[2] is None else disc,
+        increments=np.array([view.increment or [np.nan] * 3 for view in views[1:]], dtype=np.float64).reshape(-1, 3),
+        prior_m=None if radius_m is None else (easting_m, northing_m, radius_m),
     )
 
 
@@ -645,36 +654,33 @@ def _words(panel: FlightPanel) -> tuple[str, ...]:
 
 def flight_keys(shown: Sequence[FlightPanel]) -> list[Artist]:
     """Return the handles of the legend, of what is drawn."""
-    kinds: list[tuple[bool, str, dict[str, Any]]] = [
-        (True, "true path and views", {"color": TRUE, "lw": 1.2, "marker": ".", "ms": 5}),
-        (True, "start", {"color": "none", "marker": "^", "mfc": TRUE, "mec": "white", "ms": 8}),
-        (True, "end", {"color": "none", "marker": "s", "mfc": TRUE, "mec": "white", "ms": 7}),
+    line = partial(Line2D, [], [])
+    mark = partial(line, color="none")
+    kinds = [
+        (True, line(label="true path and views", color=TRUE, lw=1.2, marker=".", ms=5)),
+        (True, mark(label="start", marker="^", mfc=TRUE, mec="white", ms=8)),
+        (True, mark(label="end", marker="s", mfc=TRUE, mec="white", ms=7)),
         (
             any(not panel.is_seen.all() for panel in shown),
-            "view that sees nothing",
-            {"color": "none", "marker": "o", "mfc": "white", "mec": TRUE, "ms": 5},
+            mark(label="view that sees nothing", marker="o", mfc="white", mec=TRUE, ms=5),
         ),
         (
             any(not panel.is_on_map.all() for panel in shown),
-            "view off the map",
-            {"color": "none", "marker": "D", "mfc": OFF_MAP, "mec": TRUE, "ms": 5},
+            mark(label="view off the map", marker="D", mfc=OFF_MAP, mec=TRUE, ms=5),
         ),
         (
             any(panel.is_copied.any() for panel in shown),
-            "the map shows the same here",
-            {"color": COPY, "lw": 1.2, "marker": ".", "ms": 5},
+            line(label="the map shows the same here", color=COPY, lw=1.2, marker=".", ms=5),
         ),
-        (True, "odometer from the true start", {"color": RECKONED, "lw": 1.4, "marker": "s", "ms": 5}),
+        (True, line(label="odometer from the true start", color=RECKONED, lw=1.4, marker="s", ms=5)),
         (
             any(len(panel.lost) for panel in shown),
-            "odometer lost on the way here",
-            {"color": "none", "marker": "x", "mec": LOST, "mew": 2, "ms": 7},
+            mark(label="odometer lost on the way here", marker="x", mec=LOST, mew=2, ms=7),
         ),
-        (any(panel.carried_to for panel in shown), "carried", {"color": LOST, "lw": 1.4, "ls": "--"}),
+        (any(panel.carried_to for panel in shown), line(label="carried", color=LOST, lw=1.4, ls="--")),
         (
             any(panel.prior_m is not None for panel in shown),
-            "disc of the start (prior)",
-            {"color": PRIOR, "lw": 1.2, "ls": "--"},
+            line(label="disc of the start (prior)", color=PRIOR, lw=1.2, ls="--"),
         ),
     ]
-    return [Line2D([], [], label=label, **style) for is_drawn, label, style in kinds if is_drawn]
+    return [handle for is_drawn, handle in kinds if is_drawn]

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 import numpy as np
 import pyproj
 import shapely
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
 from sasgeo_bench.config import Document, Line, NamedDocument, find_document, list_documents, read_document
 from sasgeo_bench.errors import ConfigError
@@ -35,6 +35,8 @@ class Place(Document):
     Places of one `country` have the same mappers: they all stand in one part or half, and cluster together.
     """
 
+    without_empty: ClassVar = frozenset({"sealed", "country"})
+
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
     regions: list[str] = []
     blocks: list[str] = []
@@ -56,13 +58,6 @@ class Place(Document):
                 f"place {self.name!r} is sealed, and its part is {self.part!r}: a sealed place can only test"
             )
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out `sealed` and `country` where they are not set: such splits keep the hash of older versions."""
-        fields: dict[str, Any] = write(self)
-        unset = {name for name in ("sealed", "country") if not fields.get(name)}
-        return {name: value for name, value in fields.items() if name not in unset}
 
     @property
     def region_ids(self) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import accumulate, chain, islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -20,13 +20,13 @@ from pydantic import ConfigDict, Field, JsonValue
 
 from sasgeo_bench.config import Document, check_document
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import file_record, sha256_of
+from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, read_schema, read_table, table_writer
 from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, Evidence, pack, unpack
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest, Provenance
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.tasks.frames import FRAME, LABEL_SCHEMA, LABELS, frame_of, frame_row, label_row
 from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, TASK_VERSIONS, Head, Query, Step, Truth
@@ -150,7 +150,7 @@ PLAIN_TRUTH_SCHEMA: Final = TRUTH_SCHEMA.set(
 )
 
 
-def query_row(query: Query) -> dict[str, Any]:
+def query_row(query: Query) -> dict[str, object]:
     """Return one query as a row of `QUERY_SCHEMA`."""
     seen, prior = query.evidence, query.prior
     center = prior.center_m or (None, None)
@@ -176,7 +176,7 @@ def query_row(query: Query) -> dict[str, Any]:
     )
 
 
-def _step_row(step: Step | None) -> dict[str, Any]:
+def _step_row(step: Step | None) -> dict[str, object]:
     """Return the columns of a flight; no column for a view alone."""
     if step is None:
         return {}
@@ -192,7 +192,7 @@ def _pose_row(pose: Pose) -> dict[str, float]:
     return {name: getattr(pose, name) for name in POSE_FIELDS}
 
 
-def _vector_rows(vectors: "gpd.GeoDataFrame") -> list[dict[str, Any]]:
+def _vector_rows(vectors: "gpd.GeoDataFrame") -> list[dict[str, object]]:
     columns = [vectors[name].to_list() for name in ("class", "level", "is_bridge")]
     shapes = [bytes(shape) for shape in shapely.to_wkb(vectors.geometry.to_numpy())]
     return [
@@ -223,24 +223,18 @@ def query_of(row: dict[str, Any]) -> Query:
         candidates=tuple(Pose(**pose) for pose in row["candidates"] or ()),
         vectors=None if row["vectors"] is None else _vectors_of(row["vectors"]),
         frames=tuple(map(frame_of, row.get("frames") or ())),
-        step=_step_of(row),
+        step=None
+        if row.get("sequence_id") is None
+        else Step(
+            sequence_id=row["sequence_id"],
+            frame=row["frame"],
+            increment=None if row["increment"] is None else tuple(row["increment"]),
+            covariance=None if row["increment_covariance"] is None else tuple(row["increment_covariance"]),
+        ),
     )
 
 
-def _step_of(row: dict[str, Any]) -> Step | None:
-    """Return where the query of a row stands in a flight, None for a view alone."""
-    if row.get("sequence_id") is None:
-        return None
-    increment, covariance = row["increment"], row["increment_covariance"]
-    return Step(
-        sequence_id=row["sequence_id"],
-        frame=row["frame"],
-        increment=None if increment is None else tuple(increment),
-        covariance=None if covariance is None else tuple(covariance),
-    )
-
-
-def _vectors_of(rows: list[dict[str, Any]]) -> "gpd.GeoDataFrame":
+def _vectors_of(rows: Sequence[Mapping[str, object]]) -> "gpd.GeoDataFrame":
     import geopandas as gpd  # noqa: PLC0415 - only tables of geometry need it
 
     return gpd.GeoDataFrame(
@@ -253,7 +247,7 @@ def _vectors_of(rows: list[dict[str, Any]]) -> "gpd.GeoDataFrame":
     )
 
 
-def asked_sha256(row: Mapping[str, Any], map_hashes: Mapping[str, str]) -> str:
+def asked_sha256(row: Mapping[str, object], map_hashes: Mapping[str, str]) -> str:
     """Return the hash of all that decides an answer: the row of a query, and what `task.json` holds of its map.
 
     Fields that are null, or not in `QUERY_SCHEMA`, do not count.
@@ -279,7 +273,7 @@ def with_added(rows: Rows, added: Sequence[str] = ("detector",)) -> Rows:
     return type(rows).from_arrays(columns, schema=pa.schema([*rows.schema, *new], metadata=rows.schema.metadata))
 
 
-def truth_row(truth: Truth) -> dict[str, Any]:
+def truth_row(truth: Truth) -> dict[str, object]:
     """Return one truth as a row of `TRUTH_SCHEMA`."""
     pose = _pose_row(truth.pose) if truth.pose else dict.fromkeys(POSE_FIELDS)
     names = [name for name in TRUTH_SCHEMA.names if name not in pose and name != "measured"]
@@ -418,17 +412,10 @@ _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # of a row group, which is in memory at once
 
 
-class TaskFile(Document):
-    """Hash and size of the queries."""
-
-    sha256: str
-    bytes: Count
-
-
 class TaskFiles(Document):
     """Files of a task, of which there is one."""
 
-    queries: Annotated[TaskFile, Field(alias=QUERIES)]
+    queries: Annotated[FileRecord, Field(alias=QUERIES)]
 
 
 class TaskOrigin(Document):
@@ -436,6 +423,8 @@ class TaskOrigin(Document):
 
     Keys that a file lacks stay unset, so that a copy of the task lacks them, too.
     """
+
+    without_empty: ClassVar = frozenset({"provenance"})
 
     suite: Folder
     suite_version: Count | None = None
@@ -461,6 +450,7 @@ class TaskOrigin(Document):
     attribution: str | None = None
     segmenter: dict[str, str] | None = None  # what made the evidence of the pictures: name, version, hash
     failed_pictures: Count | None = None  # that the segmenter failed at
+    provenance: Provenance = Provenance()  # of the map
 
     @property
     def name(self) -> tuple[str, str]:
@@ -618,7 +608,7 @@ class Task:
         rows = (row for batch in read_batches(path, columns) for row in batch.to_pylist())
         return {row["query_id"]: self._asked_of(row) for row in rows}
 
-    def _asked_of(self, row: Mapping[str, Any]) -> str:
+    def _asked_of(self, row: Mapping[str, object]) -> str:
         recorded = row.get(ASKED)
         return asked_sha256(row, self.manifest.map_hashes) if recorded is None else str(recorded)
 
@@ -804,7 +794,7 @@ def write_task(
     return TaskManifest.model_validate(content)
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def _write_json(path: Path, content: Mapping[str, object]) -> None:
     path.write_text(json_text(content), encoding="utf-8")
 
 
@@ -864,16 +854,12 @@ def _counts_text(counts: Mapping[Any, int]) -> str:
 
 def read_queries(folder: str | Path) -> Iterator[Query]:
     """Yield the queries of a task in the order of their ids, a row group in memory at a time."""
-    path = given_path(folder) / QUERIES
-    for row in _rows(path, QUERY_SCHEMA):
-        yield _made(path, query_of, row)
+    yield from _parsed(given_path(folder) / QUERIES, QUERY_SCHEMA, query_of)
 
 
 def read_truths(folder: str | Path) -> Iterator[Truth]:
     """Yield the truths of a task in the order of the query ids."""
-    path = given_path(folder) / TRUTH
-    for row in _rows(path, TRUTH_SCHEMA):
-        yield _made(path, truth_of, row)
+    yield from _parsed(given_path(folder) / TRUTH, TRUTH_SCHEMA, truth_of)
 
 
 def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
@@ -918,14 +904,15 @@ def _is_known(field: pa.Field) -> bool:
     return not types or any(is_like(field.type, kind) for kind in types)
 
 
+def _parsed(path: Path, schema: pa.Schema, parse: Callable[[dict[str, object]], Made]) -> Iterator[Made]:
+    for batch in read_batches(path, schema.names):
+        for row in batch.to_pylist():
+            yield _made(path, parse, row)
+
+
 def _made(path: Path, make: Callable[[Row], Made], row: Row) -> Made:
     """Convert a row, which may be malformed."""
     try:
         return make(row)
     except (TypeError, ValueError, KeyError, AttributeError, OverflowError, shapely.errors.ShapelyError) as error:
         raise _damaged(path, error) from error
-
-
-def _rows(path: Path, schema: pa.Schema) -> Iterator[dict[str, Any]]:
-    for batch in read_batches(path, schema.names):
-        yield from batch.to_pylist()

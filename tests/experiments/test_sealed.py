@@ -16,7 +16,7 @@ from sasgeo_bench.experiments.sealed import open_seal
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import LearningSpec, PipelineFile
-from sasgeo_bench.leaderboard.private_board import sealed_lines
+from sasgeo_bench.leaderboard.text import sealed_lines
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks

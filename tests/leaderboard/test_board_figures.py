@@ -142,9 +142,9 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
     }
     (line,) = told
     assert line == (
-        "figures left out, for nothing on this board is seen in them: success against strength, recall against K, "
-        "success against cost, error along flights, how far odometers carry fixes on flights, success against the "
-        "drift of odometers"
+        "figures left out, for nothing on this board is seen in them: success against strength; error along the "
+        "way; how far the odometer carries a fix; recall against K; success against cost; success against the drift of "
+        "odometers"
     )
     for name, draw in figures.items():
         draw(tmp_path / name)
@@ -173,17 +173,17 @@ def test_a_board_without_data_has_no_figures_and_says_so(board):
             "errors-localization-r500-weak-s3.svg",
         }
     (line,) = told
-    assert line.partition(": ")[2].split(", ") == [
+    assert line.partition(": ")[2].split("; ") == [
+        "registered contrasts, place by place",
         "success against the age of the map",
-        "differences by place",
-        "recall against K",
-        "success against cost",
+        "error along the way",
+        "how far the odometer carries a fix",
         "risk against coverage",
         "reliability",
-        "the cost of decisions",
         "protection levels against errors",
-        "error along flights",
-        "how far odometers carry fixes on flights",
+        "recall against K",
+        "success against cost",
+        "the cost of decisions",
         "success against the drift of odometers",
     ]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.leaderboard.text import board_latex
+from sasgeo_bench.leaderboard.text import Contents, board_latex
 from sasgeo_bench.scoring.tables import leaderboard
 from tests.handmade import about_of, asked
 from tests.test_texts import NASTY
@@ -51,7 +51,7 @@ def test_a_board_compiles_whatever_its_matchers_are_called(tmp_path: Path) -> No
         "*",
     )
     board = leaderboard({name: asked(0.5, count=8) for name in names}, draws=100)
-    assert paper_of(board_latex(board, about_of([])), tmp_path).is_file()
+    assert paper_of(board_latex(about_of([]), Contents(leaderboard=board)), tmp_path).is_file()
 
 
 @pytest.mark.parametrize("path", sorted(RESULTS.glob("*/leaderboard.tex")), ids=lambda path: path.parent.name)

@@ -18,9 +18,10 @@ from sasgeo_bench.leaderboard.board_tables import seed_table
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.manifests import BoardEntry, PipelineRecord, SeedResult
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.leaderboard.private_board import OnPrivate, compare_seeds, result_of, seed_lines
+from sasgeo_bench.leaderboard.private_board import OnPrivate, compare_seeds, result_of
 from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.leaderboard.tables import Cell, marks_of, text_of
+from sasgeo_bench.leaderboard.text import seed_lines
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.archive import pack_board, request_of, score_all
 from sasgeo_bench.publishing.build import publish
@@ -188,7 +189,7 @@ def test_without_a_private_seed_a_row_says_run_here(made, tmp_path):
     assert entry_of(tmp_path / "board").how == "run here"
     assert not {"private", "private_seed"} & about.model_fields_set
     assert "so none is reproduced" in seed_lines(about)[0]
-    assert seed_table(about.entries) is None
+    assert not seed_table(about.entries).rows
 
 
 @has_landlock

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from sasgeo_bench.publishing.site_pages import COASTS
+from sasgeo_bench.publishing.site_maps import COASTS
 
 
 def test_every_coastline_is_a_line_on_the_globe():

@@ -36,17 +36,11 @@ from sasgeo_bench.leaderboard.manifests import (
     RegionMap,
 )
 from sasgeo_bench.leaderboard.tables import MEANINGS, file_stem, page_names, text_of, ties_of
-from sasgeo_bench.publishing import site_pages as pages
-from sasgeo_bench.publishing.site import contrasts_of, site_pages
-from sasgeo_bench.publishing.site_pages import (
-    draw_places,
-    draw_rates,
-    matchers_of,
-    place_maps,
-    places_on_map,
-    regions_of,
-)
-from sasgeo_bench.publishing.site_source import SiteSource, Spot
+from sasgeo_bench.publishing import site_maps as pages
+from sasgeo_bench.publishing.site import site_pages
+from sasgeo_bench.publishing.site_files import SiteSource, Spot
+from sasgeo_bench.publishing.site_maps import draw_places, draw_rates, place_maps, places_on_map, regions_of
+from sasgeo_bench.publishing.site_pages import contrasts_of, matchers_of
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, Falsifier
 from sasgeo_bench.scoring.rows import ALL_SUITES, FIGURE_SCHEMA, Row
@@ -403,7 +397,7 @@ def test_a_table_says_which_stress_it_counts_and_who_gave_no_sound_answer():
     scores.loc[2, "status"] = "timeout"
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {}}, scores=scores)
     (section,) = sections_of(book_of(given))
-    assert section.counted == "S1"
+    assert section.context.startswith("Stress that is counted: S1.")
     assert section.table.notes == (
         "One alone is ranked.",
         "Without a sound answer, which is a miss: graph 1 (timeout).",

@@ -5,15 +5,18 @@ import errno
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_files import RUN, Answers, CardRecord, RunManifest, StoredAnswers
+from sasgeo_bench.running.prediction_files import RUN, Answers, CardRecord, RunManifest, StoredAnswers, rounded
 from sasgeo_bench.tasks.task_files import POSE_FIELDS
 from sasgeo_bench.texts import json_text
 
@@ -262,3 +265,47 @@ def test_stored_answers_are_those_of_their_tasks_a_task_at_a_time(rows):
     lean = answers.lean()
     assert {name: replace(item, candidates=()) for name, item in answers.items()} == dict(lean)
     assert not any(item.candidates for item in lean.values())
+
+
+def poses_of(yaw_deg, easts):
+    return tuple(
+        (Pose(easting_m=east, northing_m=-east, yaw_deg=(yaw_deg + at) % 360, scale=1.0 + at / 7), 0.1 * east)
+        for at, east in enumerate(easts)
+    )
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 359.9999), st.lists(st.floats(-1e6, 1e6), max_size=3)), max_size=4), st.booleans()
+)
+def test_answers_are_rounded_once_and_only_where_no_figure_shows_it(drawn, is_flown):
+    spread = np.diag([1e-3, 2e4, 1.7]) + 0.99 * np.outer(*[np.sqrt([1e-3, 2e4, 1.7])] * 2)
+    answers = [
+        Prediction(
+            query_id=str(number),
+            candidates=poses_of(yaw_deg, easts),
+            confidence=yaw_deg / 3,
+            diagnostics={"ratio": yaw_deg / 7},
+            latency_s=0.1 * number,
+            matcher_s=0.01 * number,
+            is_accepted=True if is_flown else None,
+            covariance=tuple(spread.ravel().tolist()) if is_flown and number % 2 else None,
+        )
+        for number, (yaw_deg, easts) in enumerate(drawn)
+    ]
+    read = Answers.of(answers)
+    assert rounded(read.table).equals(read.table)
+    for exact in answers:
+        found = read.found[exact.query_id]
+        same = {"candidates": exact.candidates, "covariance": exact.covariance}
+        assert replace(found, **same) == exact
+        assert found.covariance == (exact.covariance and pytest.approx(exact.covariance, rel=2**-16))
+        for (pose, score), (given_, exact_score) in zip(found.candidates, exact.candidates, strict=True):
+            assert (score, pose.scale) == (exact_score, given_.scale)
+            assert (pose.easting_m, pose.northing_m) == pytest.approx((given_.easting_m, given_.northing_m), abs=2**-8)
+            assert abs((pose.yaw_deg - given_.yaw_deg + 180) % 360 - 180) <= 2**-8
+
+
+def test_a_covariance_that_would_be_none_when_it_is_rounded_is_kept():
+    narrow = np.array([[1.0, 1 - 1e-9, 0.0], [1 - 1e-9, 1.0, 0.0], [0.0, 0.0, 1 / 3]])
+    item = Prediction(query_id="a", candidates=(), is_accepted=False, covariance=tuple(narrow.ravel().tolist()))
+    assert Answers.of([item]).found["a"].covariance == item.covariance

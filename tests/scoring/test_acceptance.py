@@ -81,7 +81,7 @@ def test_without_absent_or_present_places_there_is_no_row():
     present = table["is_present"].to_numpy(bool)
     for some in (table[present], table[~present], table[:0]):
         assert acceptance_frame("mine", "sure", some).empty
-    assert acceptance_tables(acceptance_frame("mine", "sure", table[:0])) == ()
+    assert not list(acceptance_tables(acceptance_frame("mine", "sure", table[:0])))
 
 
 def test_the_table_shows_one_cost_and_no_control():
@@ -94,4 +94,4 @@ def test_the_table_shows_one_cost_and_no_control():
     ]
     assert table.rows[-1].cells[4].text.startswith("0.200")
     assert table.rows[-1].cells[-1].text == "-"
-    assert acceptance_tables(found.assign(matcher="random")) == ()
+    assert not list(acceptance_tables(found.assign(matcher="random")))

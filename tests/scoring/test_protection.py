@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from sasgeo_bench.leaderboard.board_tables import protection_tables
 from sasgeo_bench.matching.matcher import Prediction
-from sasgeo_bench.publishing.site_pages import protection_tables
 from sasgeo_bench.sasgeo.conformal import METHODS, RISKS, SCALE, level_name
 from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.scoring.protection import ALERT_LIMITS_M, CONFORMAL, protection_frame
@@ -101,4 +101,4 @@ def test_a_page_shows_one_alert_limit_and_says_where_the_others_are():
     assert shown.notes == ("Alert limits of 10 and 50 m: protection.parquet holds them.",)
     (alone,) = protection_tables(frame[frame["alert_limit_m"] == 50.0])
     assert (alone.title[:18], alone.notes) == ("Alert limit 50 m, ", ())
-    assert protection_tables(frame[:0]) == ()
+    assert not list(protection_tables(frame[:0]))

@@ -12,7 +12,7 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.leaderboard.board_tables import Book, summary
 from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.tables import text_of
-from sasgeo_bench.leaderboard.text import board_latex, board_markdown, tables_of, warnings_of
+from sasgeo_bench.leaderboard.text import MARKDOWN, Contents, board_latex, board_markdown, rows_of, warnings_of
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict
@@ -116,7 +116,7 @@ def test_a_fix_that_is_near_and_turned_is_no_success_and_yet_within():
     board = leaderboard({"mine": table}, draws=200)
     assert pick(board, "mine", "success_25m")["value"] == 0.25
     assert pick(board, "mine", "within_25m")["value"] == 0.75 == table["is_right"].mean()
-    (shown,) = tables_of(board)
+    (shown,) = rows_of(Contents(leaderboard=board), MARKDOWN)
     assert column_of(shown, "within_25m")[0].startswith("0.750 [")
 
 
@@ -225,7 +225,7 @@ def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():
         assert ranks(mine) == ranks(before)
         assert mine["detectable"] == before["detectable"]
     said = {name: EntryLabel("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
-    first, apart = tables_of(with_entry_labels(board, said))
+    first, apart = rows_of(Contents(leaderboard=with_entry_labels(board, said)), MARKDOWN)
     assert set(column_of(first, "matcher")) == {"good (as submitted)", "bad (as submitted)"}
     assert column_of(apart, "matcher") == ["best (as submitted) (set apart)"]
     assert apart.notes == ("best: for a reason.",)
@@ -307,12 +307,12 @@ def test_the_texts_say_the_figures_and_what_is_missing():
         "random": scores([99.0] * 4),
     }
     board = leaderboard(tables, draws=200)
-    text = board_markdown(board, ABOUT)
+    text = board_markdown(ABOUT, Contents(leaderboard=board))
     assert "| mine | 0.250 [" in text
     assert "mine: 2 queries lack a row and count as misses." in text
     assert "4 blocks in 4 places: fewer than 36 in 12" in text
     assert "(c) OpenStreetMap contributors" in text
-    latex = board_latex(board, ABOUT)
+    latex = board_latex(ABOUT, Contents(leaderboard=board))
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
     assert "success_25m" not in latex.replace(r"\_", "~")
     (short,) = summary(Book.of(board))
@@ -350,13 +350,15 @@ def test_two_versions_of_a_control_are_controls_both():
 def test_no_name_breaks_a_table():
     name = r"mine 1|2 <b> \$ {x} ~ ^"
     board = leaderboard({name: scores([1.0, 99.0])}, draws=200)
-    lines = board_markdown(board, ABOUT).splitlines()
+    lines = board_markdown(ABOUT, Contents(leaderboard=board)).splitlines()
     (at,) = (at for at, line in enumerate(lines) if "mine 1" in line)
     assert r"mine 1\|2 &lt;b>" in lines[at]
     assert lines[at].replace(r"\|", "").count("|") == lines[at - 1].count("|")  # of the rule below the head
-    assert "[U+2122]" in board_latex(leaderboard({"mine \u2122": scores([1.0])}, draws=200), ABOUT)
+    assert "[U+2122]" in board_latex(
+        ABOUT, Contents(leaderboard=leaderboard({"mine \u2122": scores([1.0])}, draws=200))
+    )
     expected = r"mine 1$|$2 $<$b$>$ \textbackslash{}\$ \{x\} \textasciitilde{} \textasciicircum{}"
-    assert expected in board_latex(board, ABOUT)
+    assert expected in board_latex(ABOUT, Contents(leaderboard=board))
 
 
 def test_the_board_says_what_each_of_its_columns_is():
@@ -366,9 +368,9 @@ def test_the_board_says_what_each_of_its_columns_is():
     costs = cost_figures("mine", Costs(scores=tables["mine"], runs=[], view_bytes=views, area_km2={}))
     rows = FIGURE_SCHEMA.frame(list(integrity_rows("mine", "own", own_confidence(tables["mine"]))))
     board = pd.concat([leaderboard(tables, draws=200), costs, rows], ignore_index=True)
-    text = board_markdown(board, ABOUT).split("## How to read")[1]
+    text = board_markdown(ABOUT, Contents(leaderboard=board)).split("## How to read")[1]
     terms = {line.split("**")[1] for line in text.splitlines() if line}
-    shown = {column.term for table in tables_of(board) for column in table.columns}
+    shown = {column.term for table in rows_of(Contents(leaderboard=board), MARKDOWN) for column in table.columns}
     assert {markdown(name) for name in shown} <= terms
     assert {"rejector", "false fixes", "latency_p50"} <= shown
     assert "no meaning" not in text
@@ -390,7 +392,7 @@ def test_one_of_something_is_told_in_the_singular():
     board = leaderboard({"mine": scores([1.0], blocks=1, place="here", status="missing")}, draws=200)
     assert warnings_of(board)[0].startswith("1 block in 1 place: fewer than 36 in 12")
     assert warnings_of(board)[1] == "mine: 1 query lacks a row and counts as a miss."
-    assert "| 1 in 1 place |" in board_markdown(board, ABOUT)
+    assert "| 1 in 1 place |" in board_markdown(ABOUT, Contents(leaderboard=board))
 
 
 def test_a_board_of_nothing_is_an_empty_table():
@@ -403,7 +405,7 @@ def test_of_candidates_a_board_says_what_guessing_is_worth():
     found = {"above": [0, 1, 0, 0], "tied": 1, "right": 1}
     board = leaderboard({"mine": scores([math.nan] * 4, track="retrieval", pool=[10, 10, 50, 50], **found)}, draws=200)
     assert pick(board, "mine", "chance_1")["value"] == pytest.approx((0.1 + 0.02) / 2)
-    assert "chance 0.060 (n = 4)" in board_markdown(board, ABOUT)
+    assert "chance 0.060 (n = 4)" in board_markdown(ABOUT, Contents(leaderboard=board))
     (short,) = summary(Book.of(board))
     heads = [[cell.text for cell in row.cells] for row in short.rows if row.tone == "head"]
     assert heads == [["queries", "4"], ["chance", "0.060"]]
@@ -414,7 +416,9 @@ def test_a_paper_gets_contrasts_controls_labels_and_where_data_are_from():
     contrast = Contrast(name="first_one", first="mine", second="other", suites=("occlusion",))
     findings = hold_contrasts([contrast], tables, {}, draws=200)
     verdict = Verdict(control="twins", matcher="mine", n=4, found=2.0, expected=2.0, p=math.nan, holds=True)
-    latex = board_latex(leaderboard(tables, draws=200), ABOUT, findings=findings, verdicts=[verdict])
+    latex = board_latex(
+        ABOUT, Contents(leaderboard=leaderboard(tables, draws=200), findings=findings, verdicts=[verdict])
+    )
     labels = re.findall(r"label{tab:(.*)}", latex)
     assert labels == ["contrasts", "board-occlusion-localization-r500-weak-s3", "controls"]
     captions = [line for line in latex.splitlines() if line.startswith(r"\caption")]

@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import cv2
 import numpy as np
@@ -23,6 +23,9 @@ from sasgeo_baselines.image.orb_vlad import centred
 from sasgeo_baselines.image.view_image import LIMITS, PICTURE, Ortho, ViewImage, side_of, view_image
 from sasgeo_baselines.segmenters.features import ColourBalance, lab_planes
 from sasgeo_baselines.segmenters.network import MULTIPLE, card_with, encoded, input_planes, read_encoder, torch_module
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Planes = NDArray[np.float32]
 Known = NDArray[np.bool_]
@@ -44,7 +47,7 @@ class Encoder:
     """Encoder of a `unet`: what it sees of pictures with pixels of 0.5 m, as descriptors of blocks of 8 m."""
 
     torch: Any
-    arrays: dict[str, Any]
+    arrays: dict[str, "Tensor"]
 
     @classmethod
     def of(cls, path: Path, *, name: str) -> Self:

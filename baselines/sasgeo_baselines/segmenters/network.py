@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.segmenters.features import ColourBalance, Plane, lab_planes
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Weights = dict[str, NDArray[np.float32]]
 Card = TypeVar("Card", sgb.SegmenterCard, sgb.MatcherCard)
@@ -109,7 +112,7 @@ def drawn_weights(classes: int, rng: np.random.Generator) -> Weights:
     return found
 
 
-def encoded(torch: Any, arrays: Mapping[str, Any], planes: Any) -> list[Any]:  # noqa: ANN401 - tensors
+def encoded(torch: Any, arrays: Mapping[str, "Tensor"], planes: "Tensor") -> list["Tensor"]:  # noqa: ANN401 - a module
     """Return the channels of every level of pictures, tensors of shape (N, WIDTHS[level], rows, columns)."""
     functional = torch.nn.functional
     at = functional.pixel_unshuffle(planes, _FOLD)
@@ -120,7 +123,7 @@ def encoded(torch: Any, arrays: Mapping[str, Any], planes: Any) -> list[Any]:  #
     return levels
 
 
-def log_odds(torch: Any, arrays: Mapping[str, Any], planes: Any) -> Any:  # noqa: ANN401 - tensors
+def log_odds(torch: Any, arrays: Mapping[str, "Tensor"], planes: "Tensor") -> "Tensor":  # noqa: ANN401 - a module
     """Return the log-odds of each class at each pixel of pictures, shape (N, classes, H, W)."""
     functional = torch.nn.functional
     *levels, at = encoded(torch, arrays, planes)
@@ -131,7 +134,7 @@ def log_odds(torch: Any, arrays: Mapping[str, Any], planes: Any) -> Any:  # noqa
     return functional.pixel_shuffle(found, _FOLD)
 
 
-def _block(functional: Any, arrays: Mapping[str, Any], name: str, at: Any) -> Any:  # noqa: ANN401 - tensors
+def _block(functional: Any, arrays: Mapping[str, "Tensor"], name: str, at: "Tensor") -> "Tensor":  # noqa: ANN401 - a module
     for number in range(2):
         kernel, scale, shift = (arrays[f"{name}.{number}.{part}"] for part in ("kernel", "scale", "shift"))
         at = functional.conv2d(at, kernel, padding=1)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import cv2
 import numpy as np
@@ -34,6 +34,9 @@ from sasgeo_baselines.segmenters.network import (
     weights_of,
     weights_text,
 )
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 Pixels = NDArray[np.uint8]
 
@@ -264,7 +267,7 @@ def _fit(torch: Any, weights: Weights, crops: Crops, *, steps: int, rng: np.rand
     return {name: np.asarray(values.detach().numpy(), dtype=np.float32) for name, values in arrays.items()}
 
 
-def _loss(torch: Any, found: Any, labels: Any) -> Any:  # noqa: ANN401 - tensors
+def _loss(torch: Any, found: "Tensor", labels: "Tensor") -> "Tensor":  # noqa: ANN401 - a module
     known = labels != sgb.UNKNOWN
     truth = (labels == sgb.PRESENT).to(found.dtype)
     each = torch.nn.functional.binary_cross_entropy_with_logits(found, truth, reduction="none")
@@ -272,14 +275,14 @@ def _loss(torch: Any, found: Any, labels: Any) -> Any:  # noqa: ANN401 - tensors
 
 
 @lru_cache(maxsize=1)
-def _network(learned: str) -> tuple[tuple[str, ...], dict[str, Any]]:
+def _network(learned: str) -> tuple[tuple[str, ...], dict[str, "Tensor"]]:
     """Read the learned text; every call of a process gets the same."""
     classes, weights = weights_of(learned)
     torch = torch_module(UNet.card.name)
     return classes, {name: torch.from_numpy(values) for name, values in weights.items()}
 
 
-def _chances(torch: Any, arrays: dict[str, Any], planes: Plane, classes: int) -> Plane:  # noqa: ANN401 - a module
+def _chances(torch: Any, arrays: dict[str, "Tensor"], planes: Plane, classes: int) -> Plane:  # noqa: ANN401 - a module
     """Return the probability of each class, shape (classes, H, W), tile by tile."""
     found = np.empty((classes, *planes.shape[1:]), dtype=np.float32)
     with torch.inference_mode():

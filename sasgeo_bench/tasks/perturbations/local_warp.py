@@ -6,7 +6,7 @@ Cells no longer overlap with the map, while roads keep their order: a graph shou
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ class Warp(ABC):
     `rms_m` is the root mean square length of the displacement, metres; exact in every view.
     """
 
+    moves_cells: ClassVar = True  # so that an unknown cell may become known
     rms_m: float
 
     def __post_init__(self) -> None:

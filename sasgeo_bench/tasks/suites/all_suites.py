@@ -1,21 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """All suites by name: ours by family, a line here for each, and those of installed packages."""
 
-import os
-import re
-import sys
 from functools import lru_cache
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.files.plugins import SUITES as GROUP
-from sasgeo_bench.files.plugins import find_plugin, list_entry_points, made, plugin_code, unknown
+from sasgeo_bench.files.plugins import check_own_name, find_inside, list_entry_points, made, plugin_code
 from sasgeo_bench.tasks.query import BY
 from sasgeo_bench.tasks.suites import ages, board_controls, flights, pictures, twins, views
 from sasgeo_bench.tasks.suites.base import Suite
 from sasgeo_bench.tasks.suites.flights import FlightSuite
-
-_NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")  # of a suite: it becomes a folder
 
 SUITES: Final[dict[str, Suite]] = {
     suite.card.name: suite
@@ -137,25 +132,12 @@ def suite_code(spec: str) -> str | None:
 
 @lru_cache(maxsize=64)
 def _foreign(spec: str) -> Suite:
-    if ":" in spec and os.getcwd() not in sys.path:  # noqa: PTH109 - a text; `module:NAME` may lie in the working folder
-        sys.path.insert(0, os.getcwd())  # noqa: PTH109
     try:
-        if ":" not in spec and spec not in list_entry_points(GROUP):
-            raise unknown(spec, GROUP, others=EVERY_SUITE)
-        found = find_plugin(spec, GROUP)
+        found = find_inside(spec, GROUP, shipped=EVERY_SUITE)
         suite = found if isinstance(found, Suite) else made(spec, found)
+        if isinstance(suite, Suite):
+            check_own_name(spec, suite.card.name, GROUP, shipped=EVERY_SUITE, where="its card")
+            return suite
     except MatchError as error:
         raise ConfigError(str(error)) from error
-    if not isinstance(suite, Suite):
-        raise ConfigError(f"{spec}: a {type(suite).__name__} is no suite: name an instance of sasgeo_bench.Suite")
-    name = suite.card.name
-    if not _NAME.fullmatch(name):
-        raise ConfigError(f"{spec}: its card is named {name!r}: lower-case letters, digits, - and _ make a name")
-    if name in EVERY_SUITE:
-        raise ConfigError(f"{spec}: its card is named {name!r}, as a suite that ships: rename it")
-    if ":" not in spec and name != spec:
-        raise ConfigError(
-            f"{spec}: its card is named {name!r}, and queries are found by one name: give the entry point "
-            "(pyproject.toml) and the card the same, and install it again"
-        )
-    return suite
+    raise ConfigError(f"{spec}: a {type(suite).__name__} is no suite: name an instance of sasgeo_bench.Suite")

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Metrics of other packages: found by name or module:NAME, and measured on scored rows."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from numbers import Real
+from typing import Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.errors import MatchError, MetricError
+from sasgeo_bench.files.plugins import METRICS as GROUP
+from sasgeo_bench.files.plugins import check_own_name, code_of, find_inside, list_entry_points, plugin_code
+from sasgeo_bench.progress import tell
+from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.metric import MeanMetric, Metric
+from sasgeo_bench.scoring.metrics import METRICS, TRACKS
+from sasgeo_bench.scoring.rows import LEADERBOARD_SCHEMA
+from sasgeo_bench.scoring.score import NOT_APPLICABLE
+from sasgeo_bench.texts import message_of
+
+SHIPPED: Final[Mapping[str, Metric]] = {metric.name: metric for metric in METRICS}
+COLUMNS: Final = frozenset({*LEADERBOARD_SCHEMA.names, "rank", "control"})  # of boards and their tables
+_SLACK: Final = 1e-9  # of a value beside its bound
+
+
+class ForeignMetric(NamedTuple):
+    """A metric of another package, as it was named, and the SHA-256 of its code."""
+
+    spec: str
+    metric: MeanMetric
+    sha256: str
+
+    @property
+    def code(self) -> str:
+        """Return where its code is, as module:NAME."""
+        return ":".join(code_of(self.spec, GROUP))
+
+
+def list_metrics() -> tuple[str, ...]:
+    """Return the names of all metrics: ours in the order of their table, then those of installed packages."""
+    return (*SHIPPED, *(name for name in list_entry_points(GROUP) if name not in SHIPPED))
+
+
+def find_metric(spec: str) -> Metric:
+    """Return the metric of a name, or of "module:NAME": an instance of `MeanMetric`.
+
+    Raise `MatchError` if there is none, with the nearest name, or it cannot be imported, is no metric, says nothing of
+    itself, or has the name of another one.
+
+    >>> find_metric("success_25m").better
+    'higher'
+    >>> find_metric("succes_25m")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: there is no metric 'succes_25m', did you mean 'success_25m'? (list metrics shows
+    all; or module:NAME)
+    """
+    return SHIPPED[spec] if spec in SHIPPED else _foreign(spec)
+
+
+def find_metrics(specs: Sequence[str]) -> tuple[ForeignMetric, ...]:
+    """Return metrics of other packages; raise `MatchError` as `find_metric` does, for one of ours, or two of a name."""
+    ours = next((spec for spec in specs if spec in SHIPPED), None)
+    if ours is not None:
+        raise MatchError(f"{ours} is on every board: name metrics of your own alone")
+    found = [ForeignMetric(spec, _foreign(spec), plugin_code(spec, GROUP)) for spec in dict.fromkeys(specs)]
+    first = {item.metric.name: item.spec for item in reversed(found)}
+    twice = next((item for item in found if first[item.metric.name] != item.spec), None)
+    if twice is not None:
+        raise MatchError(
+            f"{first[twice.metric.name]} and {twice.spec} are both named {twice.metric.name!r}: rename one"
+        )
+    return tuple(found)
+
+
+def _foreign(spec: str) -> MeanMetric:
+    found = find_inside(spec, GROUP, shipped=SHIPPED)
+    if not isinstance(found, MeanMetric):
+        is_function = callable(found) and not isinstance(found, type)
+        what = "a function" if is_function else f"an object of type {type(found).__name__}"
+        mend = f": name MeanMetric(name=..., values={spec.partition(':')[2]}, ...)" if is_function else ""
+        raise MatchError(f"{spec}: {what} is no metric, which is an instance of sasgeo_bench.MeanMetric{mend}")
+    check_own_name(spec, found.name, GROUP, shipped=SHIPPED)
+    fault = _silence(found)
+    if fault:
+        raise MatchError(f"{spec}: {fault}")
+    return found
+
+
+def _silence(metric: MeanMetric) -> str | None:
+    """Return what a metric should say of itself, and does not; None if it says all."""
+    blank = next((name for name in ("meaning", "unit", "source") if not _is_line(getattr(metric, name))), None)
+    bounds = metric.bounds if isinstance(metric.bounds, tuple | list) else ()
+    are_bounds = len(bounds) == 2 and all(isinstance(end, Real) for end in bounds) and bounds[0] < bounds[1]
+    tracks = metric.tracks if isinstance(metric.tracks, tuple | list) else ()
+    are_tracks = bool(tracks) and all(track in TRACKS for track in tracks)
+    faults = {
+        f"it is named {metric.name!r}, as a column of boards: rename it": metric.name in COLUMNS,
+        f"its {blank} is {getattr(metric, str(blank), '')!r}, expected a line of text": blank is not None,
+        f"better is {metric.better!r}, expected 'higher' or 'lower'": metric.better not in ("higher", "lower"),
+        f"bounds are {metric.bounds!r}, expected the least and the greatest value, as in (0.0, 1.0)": not are_bounds,
+        f"tracks are {metric.tracks!r}, expected some of {TRACKS}": not are_tracks,
+        "is_primary is true, and boards rank by metrics that ship alone: leave it out": metric.is_primary,
+        "values is no function of scored rows": not callable(metric.values),
+        "counts is no function of scored rows": not callable(metric.counts),
+    }
+    return next((fault for fault, is_there in faults.items() if is_there), None)
+
+
+def _is_line(value: object) -> bool:
+    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
+
+
+def values_of(metric: MeanMetric, scores: pd.DataFrame) -> Floats:
+    """Return the value of each row by a metric of another package, shape (N,); NaN for a query that does not count.
+
+    It is given a copy. Raise `MetricError` if it fails, or a value is no number, or out of bounds.
+    """
+    rows = scores.reset_index(drop=True)
+    try:
+        given = metric.values(rows.copy())
+        counts = np.asarray(metric.counts(rows.copy()))
+    except (Exception, SystemExit) as error:  # whatever code of somebody's own raises
+        raise MetricError(f"it fails ({message_of(error)})") from error
+    if isinstance(given, pd.Series) and not given.index.equals(rows.index):
+        raise MetricError("its values are of other rows, or in another order, than the scores")
+    values = _numbers(given)
+    for what, column in (("values have", values), ("counts have", counts)):
+        if column.shape != (len(rows),):
+            raise MetricError(f"its {what} shape {column.shape}, expected ({len(rows)},): one for each row of scores")
+    if counts.dtype != bool:
+        raise MetricError(f"its counts are of type {counts.dtype}, expected bool")
+    values = np.where(counts, values, np.nan)
+    low, high = metric.bounds
+    wrong = np.isinf(values) | (values < low - _SLACK) | (values > high + _SLACK)
+    if wrong.any():
+        raise MetricError(
+            f"it says {values[wrong][0]:g}, expected a finite number between {low:g} and {high:g}, or NaN for a query "
+            "that does not count"
+        )
+    return np.clip(values, low, high)
+
+
+def _numbers(given: object) -> Floats:
+    """Return what a function returned as floats; bools count as 0 and 1."""
+    values = np.asarray(given)
+    if (
+        values.dtype.kind == "O"
+        and values.ndim == 1
+        and all(isinstance(one, Real | np.bool_) or one is pd.NA for one in values)
+    ):
+        values = np.array([math.nan if one is pd.NA else one for one in values], dtype=float)
+    if values.dtype.kind not in "biuf":
+        raise MetricError(
+            f"it returns a {type(given).__name__} of no numbers, expected a number for each row of scores"
+        )
+    return np.asarray(values, dtype=float)
+
+
+def measured(
+    found: Sequence[ForeignMetric], scores: Mapping[str, pd.DataFrame]
+) -> tuple[dict[str, pd.DataFrame], tuple[MeanMetric, ...]]:
+    """Measure scored rows by matcher with metrics of other packages; return the rows with a column for each of them.
+
+    The metrics that are returned read those columns, so that code that is not ours is called once, here. Raise
+    `MetricError`, naming the metric, if it fails, or counts a query of one matcher and not of another.
+    """
+    frames = dict(scores)
+    for spec, metric, _ in found:
+        columns = {name: _column(metric, frame, spec=spec, matcher=name) for name, frame in scores.items()}
+        fault = unequal(columns, scores)
+        if fault:
+            raise MetricError(f"{spec}: {fault}")
+        if not any(np.isfinite(column).any() for column in columns.values()):
+            tell(f"{metric.name}: no query of this board counts, so it has no figures")
+        frames = {name: frame.assign(**{_key(metric): columns[name]}) for name, frame in frames.items()}
+    return frames, tuple(
+        replace(
+            item.metric, values=partial(_read, key=_key(item.metric)), counts=partial(_is_there, key=_key(item.metric))
+        )
+        for item in found
+    )
+
+
+def _key(metric: MeanMetric) -> str:
+    return f"metric {metric.name}"  # no column of scores has a space
+
+
+def _read(scores: pd.DataFrame, key: str) -> Floats:
+    return scores[key].to_numpy(float)
+
+
+def _is_there(scores: pd.DataFrame, key: str) -> Bools:
+    return scores[key].notna().to_numpy(bool)
+
+
+def _column(metric: MeanMetric, frame: pd.DataFrame, *, spec: str, matcher: str) -> Floats:
+    """Return the values of all rows of a matcher; NaN on other tracks, and where its card excludes the task."""
+    values = np.full(len(frame), np.nan)
+    is_asked = (frame["status"] != NOT_APPLICABLE).to_numpy(bool)
+    for track in metric.tracks:
+        mine = is_asked & (frame["track"] == track).to_numpy(bool)
+        if mine.any():
+            try:
+                values[mine] = values_of(metric, frame[mine])
+            except MetricError as error:
+                raise MetricError(f"{spec}, on the answers of {matcher} ({track}): {error}") from error
+    return values
+
+
+def unequal(columns: Mapping[str, Floats], scores: Mapping[str, pd.DataFrame]) -> str | None:
+    """Say which query counts for one matcher and not for another."""
+    counted: dict[str, tuple[bool, str]] = {}
+    for name, values in columns.items():
+        is_asked = (scores[name]["status"] != NOT_APPLICABLE).to_numpy(bool)
+        ids, counts = scores[name]["query_id"].to_numpy(object)[is_asked], ~np.isnan(values[is_asked])
+        for query, does in zip(ids.tolist(), counts.tolist(), strict=True):
+            before, other = counted.setdefault(query, (does, name))
+            if before != does:
+                first, second = (name, other) if does else (other, name)
+                return (
+                    f"query {query} counts for {first}, and not for {second}: what counts may depend on the query and "
+                    "its truth, never on the answer, or a method could choose its queries"
+                )
+    return None

@@ -131,7 +131,7 @@ def test_a_region_has_no_card_to_be_shown(mistake) -> None:
 
 def test_a_name_that_nothing_has_is_not_checked(check, mistake) -> None:
     del check
-    words = "there is no matcher, tracker, segmenter or suite 'raster_uniformm', did you mean 'raster_uniform'?"
+    words = "there is no matcher, tracker, segmenter, suite, metric or perturbation 'raster_uniformm', did you mean 'raster_uniform'?"
     assert words in mistake("check", "raster_uniformm")
 
 

@@ -131,8 +131,10 @@ def test_a_region_has_no_card_to_be_shown(mistake) -> None:
 
 def test_a_name_that_nothing_has_is_not_checked(check, mistake) -> None:
     del check
-    words = "there is no matcher, tracker, segmenter, suite, metric or perturbation 'raster_uniformm', did you mean 'raster_uniform'?"
-    assert words in mistake("check", "raster_uniformm")
+    kinds = "matcher, tracker, segmenter, suite, metric or perturbation"
+    assert f"there is no {kinds} 'raster_uniformm', did you mean 'raster_uniform'?" in mistake(
+        "check", "raster_uniformm"
+    )
 
 
 def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, monkeypatch) -> None:

@@ -101,7 +101,7 @@ def _draw(of: Profile, path: Path) -> None:
     about = Page(
         title=f"Latency of {of.matcher} on {of.region}",
         data=ATTRIBUTION,
-        facts=f"{counted(of.machine['cores'], 'core')} of {of.machine['processor']}",
+        facts=f"{counted(int(of.machine['cores']), 'core')} of {of.machine['processor']}",
         note=note,
         panel_inches=(6.4, 2.6),
         keys=(

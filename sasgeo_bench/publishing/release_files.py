@@ -347,7 +347,7 @@ def _write_batches(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBat
                 target.write_batch(batch.select(schema.names).cast(schema))
 
 
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+def _write_json(path: Path, content: Mapping[str, object]) -> None:
     path.write_text(json_text({**content, "licence": LICENCE, "attribution": ATTRIBUTION}), encoding="utf-8")
 
 

@@ -168,7 +168,7 @@ class RunManifest(Record):
         with fresh_file(folder / RUN, mend="check your rights and the free space") as scratch:
             scratch.write_text(json_text(self.content()), encoding="utf-8")
 
-    def content(self) -> dict[str, Any]:
+    def content(self) -> dict[str, object]:
         """Return what `run.json` states, for a writer of JSON."""
         return self.model_dump(mode="json", exclude_unset=True)
 
@@ -230,7 +230,7 @@ def schema_of(predictions: Iterable[Prediction]) -> pa.Schema:
     return FLOWN_SCHEMA if any(item.is_accepted is not None for item in predictions) else PREDICTION_SCHEMA
 
 
-def prediction_row(prediction: Prediction) -> dict[str, Any]:
+def prediction_row(prediction: Prediction) -> dict[str, object]:
     """Return a prediction as a row of `PREDICTION_SCHEMA`."""
     return {
         "query_id": prediction.query_id,
@@ -533,7 +533,7 @@ def write_part(folder: Path, predictions: Sequence[Prediction], *, asked: Mappin
     path = folder / f"part-{_stamp_ns(folder):020d}-{os.getpid()}.parquet"
     rows = [prediction_row(item) for item in predictions]
     if asked is not None:
-        rows = [row | {ASKED: asked[row["query_id"]]} for row in rows]
+        rows = [row | {ASKED: asked[item.query_id]} for row, item in zip(rows, predictions, strict=True)]
     table = pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA if asked is None else PART_SCHEMA)
     with fresh_file(path, mend="free some space and run again, it continues there") as scratch:
         write_table(table, scratch)

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import cycle
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import psutil
@@ -90,7 +90,7 @@ class Profile:
     km2: float
     suites: tuple[str, ...]
     queries: int
-    machine: Mapping[str, Any]
+    machine: Mapping[str, str | float]
     start_s: float
     prepare_s: float
     first_s: float
@@ -148,7 +148,7 @@ class Profile:
         side = "above" if change > 0 else "below"
         return f"the median of the last minute is {abs(change):.0%} {side} that of the first; {known}"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return all of it as plain values."""
         return asdict(self)
 
@@ -316,7 +316,7 @@ def _sustained(
     return fixes, readings
 
 
-def _machine(cores: Sequence[int], request: ProfileRequest) -> dict[str, Any]:
+def _machine(cores: Sequence[int], request: ProfileRequest) -> dict[str, str | float]:
     return {
         "processor": processor_name(),
         "cores": len(cores),

@@ -93,7 +93,7 @@ test-quick: $(STAMP) ## run, for a first look, the tests that need nothing built
 test-torch: $(STAMP) ## install the extra [torch] of both packages and run the tests that need it; a PyTorch in .venv is kept
 	$(PIP) install --quiet --no-build-isolation -e '.[torch]' -e 'baselines[torch]'
 	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(addprefix tests/baselines/test_,unet.py deep_retrieval.py image_matchers.py orienternet.py) \
-	  tests/search/test_torch_search.py tests/datasets/test_torch.py $(ARGS)
+	  tests/search/test_torch_search.py tests/tasks/test_torch.py $(ARGS)
 
 test-oldest: ## run the tests of test-quick with the oldest dependencies that pyproject.toml allows, in .venv-oldest (needs uv)
 	$(PYTHON) -m venv .venv-oldest

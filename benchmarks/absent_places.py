@@ -29,11 +29,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import SasgeoError
-from sasgeo_bench.leaderboard.board_files import read_board_manifest, read_scores
+from sasgeo_bench.boards.archive_file import read_stored_predictions
+from sasgeo_bench.boards.board_files import read_board_manifest, read_scores
+from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.plugins import rejector_maker
-from sasgeo_bench.publishing.archive_file import read_stored_predictions
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.decisions import Fixes, accept, presence_weights, risk_coverage
 from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, seed_of_text

@@ -21,8 +21,8 @@ import numpy as np
 
 import sasgeo_bench as sgb
 from benchmarks.open_numbers import drawn, systems
-from sasgeo_bench.errors import MatchError, SasgeoError
-from sasgeo_bench.files.plugins import MATCHERS, check_names, list_entry_points
+from sasgeo_bench.core.errors import MatchError, SasgeoError
+from sasgeo_bench.core.plugins import MATCHERS, check_names, list_entry_points
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.task_files import query_bytes
 

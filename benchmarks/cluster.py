@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import sasgeo_bench as sgb
-from sasgeo_bench.progress import spread
+from sasgeo_bench.core.progress import spread
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.tasks import task_files

@@ -21,8 +21,8 @@ from matplotlib.colors import Normalize
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import Page, page
-from sasgeo_bench.errors import FlightError, SasgeoError
+from sasgeo_bench.core.canvas import Page, page
+from sasgeo_bench.core.errors import FlightError, SasgeoError
 from sasgeo_bench.flights.kinematics import crab_deg, fly, tilt_deg, yaw_rate_deg_s
 from sasgeo_bench.flights.plans import KINDS, PlanKind, Ways, plan_flight
 from sasgeo_bench.flights.trajectory import Trajectory

@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.leaderboard.board_files import read_scores
-from sasgeo_bench.publishing.archive_file import read_stored_predictions, unpack_tasks
+from sasgeo_bench.boards.archive_file import read_stored_predictions, unpack_tasks
+from sasgeo_bench.boards.board_files import read_scores
+from sasgeo_bench.core.errors import SasgeoError, StoreError
 from sasgeo_bench.scoring.flights import view_frame
 from sasgeo_bench.scoring.intervals import ClusterDraws, percentile_interval, seed_of_text
 from sasgeo_bench.tasks.query import SEQUENCE

@@ -32,10 +32,10 @@ import numpy as np
 from sasgeo_baselines.tunable import Tunable
 
 import sasgeo_bench as sgb
-from sasgeo_bench.errors import MatchError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.errors import MatchError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.texts import NAME, one_line
 from sasgeo_bench.sasgeo.variants import Sasgeo
 from sasgeo_bench.search.plan import Plan
-from sasgeo_bench.texts import NAME, one_line
 
 HALVES = (("krems", "porto"), ("london", "vaduz"))  # towns on which systems were tried while they were built
 SUITES = {"clean": ("perception",), "local-warp": ("G1 tilt",)}

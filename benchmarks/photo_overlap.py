@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.photos import Photo, read_photo

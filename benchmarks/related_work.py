@@ -32,10 +32,10 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.sim_to_real import estimate, line
-from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.leaderboard.board_files import MEND, SCHEMAS, read_board_manifest, read_leaderboard, read_scores
+from sasgeo_bench.boards.board_files import MEND, SCHEMAS, read_board_manifest, read_leaderboard, read_scores
+from sasgeo_bench.core.errors import SasgeoError, StoreError
+from sasgeo_bench.core.texts import markdown_code
 from sasgeo_bench.scoring.intervals import LEAST_CLUSTERS, difference_interval, wilson_share
-from sasgeo_bench.texts import markdown_code
 
 PAPER = {
     "vojir_instance_rays": "Vojir 2020",

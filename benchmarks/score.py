@@ -26,12 +26,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.growth import draw
+from sasgeo_bench.boards.archive import score_all
+from sasgeo_bench.boards.build import make_board
+from sasgeo_bench.boards.scored import ScoreRequest
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.matching.matcher import Prediction
-from sasgeo_bench.publishing.archive import score_all
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import CardRecord, RunManifest

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.search.field import FULL, Field, Template, between, warped

@@ -1,26 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 # The public names, and where each comes from: for type checkers, and for `lazy_loader`, which reads them here.
 
+from .boards.board import StoredBoard as StoredBoard
+from .boards.board import read_board as read_board
+from .boards.cases import plot_query as plot_query
 from .cli.boards import score as score
 from .cli.publishing import publish as publish
 from .cli.queries import make_tasks as make_tasks
 from .cli.regions import build_region as build_region
 from .cli.regions import render_imagery as render_imagery
 from .cli.runs import run as run
-from .datasets.torch import PictureDataset as PictureDataset
-from .datasets.torch import QueryDataset as QueryDataset
-from .datasets.torch import task_pictures as task_pictures
-from .files.storage import fetch as fetch
-from .files.storage import send as send
+from .core.storage import fetch as fetch
+from .core.storage import send as send
+from .core.texts import MOST_CANDIDATES as MOST_CANDIDATES
 from .geometry.grid import Grid as Grid
 from .geometry.pose import Pose as Pose
 from .geometry.pose import Prior as Prior
 from .geometry.pose import inverse as inverse
 from .geometry.pose import rotation as rotation
 from .geometry.pose import wrap_deg as wrap_deg
-from .leaderboard.board import StoredBoard as StoredBoard
-from .leaderboard.board import read_board as read_board
-from .leaderboard.cases import plot_query as plot_query
 from .matching.belief_fix import fix_of as fix_of
 from .matching.belief_fix import followed as followed
 from .matching.cards import read_card as read_card
@@ -166,6 +164,8 @@ from .tasks.task_files import Task as Task
 from .tasks.task_files import read_queries as read_queries
 from .tasks.task_files import read_task as read_task
 from .tasks.task_files import read_truths as read_truths
-from .texts import MOST_CANDIDATES as MOST_CANDIDATES
+from .tasks.torch import PictureDataset as PictureDataset
+from .tasks.torch import QueryDataset as QueryDataset
+from .tasks.torch import task_pictures as task_pictures
 
 __version__: str

@@ -19,11 +19,12 @@ import pytest
 from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
-from sasgeo_bench import cli, progress
+from sasgeo_bench import cli
+from sasgeo_bench.boards import board_pictures, build
+from sasgeo_bench.boards.board_figures import figures_extra
+from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.core import progress
 from sasgeo_bench.experiments import pipeline
-from sasgeo_bench.leaderboard import board_pictures, build
-from sasgeo_bench.leaderboard.board_figures import figures_extra
-from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.testing import TinyPlace, tiny_place
@@ -228,7 +229,7 @@ def in_threads() -> Iterator[None]:
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Work for several jobs is done here, each item and result pickled: for tests that are about the same results.
 
-    Processes take seconds to start. tests/test_progress.py, test_outlets.py and test_task_batch.py start some.
+    Processes take seconds to start. tests/core/test_progress.py, test_outlets.py and test_task_batch.py start some.
     """
 
     def found(work: Callable[[Any], Any], items: Sequence[Any], jobs: int) -> Iterator[Any]:
@@ -282,7 +283,7 @@ def plain_site(monkeypatch: pytest.MonkeyPatch) -> None:
         path.write_text('<svg xmlns="http://www.w3.org/2000/svg" width="90pt" height="45pt"/>', encoding="utf-8")
 
     for name in ("draw_places", "draw_rates"):
-        monkeypatch.setattr(f"sasgeo_bench.publishing.build.{name}", blank)
+        monkeypatch.setattr(f"sasgeo_bench.boards.publish.{name}", blank)
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.canvas import page
-from sasgeo_bench.leaderboard.board_files import ANSWER_SCHEMA, Extra, write_board
-from sasgeo_bench.leaderboard.manifests import BoardManifest
-from sasgeo_bench.leaderboard.plots import BoardPage
+from sasgeo_bench.boards.board_files import ANSWER_SCHEMA, Extra, write_board
+from sasgeo_bench.boards.manifests import BoardManifest
+from sasgeo_bench.boards.plots import BoardPage
+from sasgeo_bench.core.canvas import page
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict

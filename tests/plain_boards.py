@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from sasgeo_bench.leaderboard import build
+from sasgeo_bench.boards import build
 from sasgeo_bench.scoring import rejection
 from sasgeo_bench.scoring.rejection import acceptance_frame
 

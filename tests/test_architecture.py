@@ -18,11 +18,11 @@ ROOT = Path(sasgeo_bench.__file__).parent
 # that is added to a folder edits nothing here.
 HOUSE = (
     # What any program needs.
-    *("texts", "errors", "config", "progress", "files", "canvas"),
+    "core",
     # The pipeline.
     *("geometry", "osm", "regions", "ageing", "search", "sensing", "flights", "tasks"),
-    *("datasets", "matching", "sasgeo", "running"),
-    *("scoring", "leaderboard", "publishing", "importers", "experiments", "cli", "__main__"),
+    *("matching", "sasgeo", "running"),
+    *("scoring", "boards", "exchange", "experiments", "cli", "__main__"),
 )
 
 # What draws the queries, and what answers them: a scorer that used a generator's code would know too much.
@@ -164,10 +164,10 @@ def test_imports_of_rooms_above_of_files_beside_and_of_other_packages_are_no_vio
         "__init__.py": "from sasgeo_bench.cli import main",
         "cli/__init__.py": "import numpy as np\nfrom sasgeo_bench.osm import Extract\nfrom sasgeo_bench import osm",
         "osm/__init__.py": "from sasgeo_bench.osm.read import Extract",
-        "osm/read.py": "from sasgeo_bench.osm import locate\nfrom sasgeo_bench.errors import ExtractError",
-        "osm/locate.py": "from sasgeo_bench.errors import ExtractError",
+        "osm/read.py": "from sasgeo_bench.osm import locate\nfrom sasgeo_bench.core.errors import ExtractError",
+        "osm/locate.py": "from sasgeo_bench.core.errors import ExtractError",
     }
-    assert house_faults(files, ("errors", "osm", "cli")) == []
+    assert house_faults(files, ("core", "osm", "cli")) == []
     assert circle(files) == []
     assert set(circle(files | {"osm/locate.py": "def late():\n    import sasgeo_bench.osm.read"})) >= {"osm.read"}
 

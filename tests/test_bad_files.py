@@ -27,26 +27,26 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.files import read_ageing
 from sasgeo_bench.ageing.measure import DTYPES
-from sasgeo_bench.config import parse_toml, shipped_dir
-from sasgeo_bench.errors import MOST_MESSAGE, SasgeoError
-from sasgeo_bench.files.folders import check_site, sha256_of
-from sasgeo_bench.files.parquet import write_frame
+from sasgeo_bench.boards.archive_file import StoredRun, unpack, write_pack
+from sasgeo_bench.boards.manifests import PackManifest
+from sasgeo_bench.boards.pipeline_spec import read_pipeline_file
+from sasgeo_bench.boards.site_files import read_board_files
+from sasgeo_bench.core.config import parse_toml, shipped_dir
+from sasgeo_bench.core.errors import MOST_MESSAGE, SasgeoError
+from sasgeo_bench.core.folders import check_site, sha256_of
+from sasgeo_bench.core.parquet import write_frame
+from sasgeo_bench.exchange.importers.kinds import read_dataset
+from sasgeo_bench.exchange.importers.reports import score_ranking
+from sasgeo_bench.exchange.importers.retrieval import read_ranking
+from sasgeo_bench.exchange.release_files import check_target
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.importers.kinds import read_dataset
-from sasgeo_bench.importers.reports import score_ranking
-from sasgeo_bench.importers.retrieval import read_ranking
-from sasgeo_bench.leaderboard.manifests import PackManifest
-from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
 from sasgeo_bench.matching.cards import read_card_file, read_learned
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import AnsweredTask, Card, Submission, example_card
 from sasgeo_bench.osm.history import DatedExtract, read_history
 from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.publishing.archive_file import StoredRun, unpack, write_pack
-from sasgeo_bench.publishing.release_files import check_target
-from sasgeo_bench.publishing.site_files import read_board_files
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import read_region_file
 from sasgeo_bench.running import prediction_files
@@ -57,8 +57,8 @@ from sasgeo_bench.scoring.entries import find_entries
 from sasgeo_bench.scoring.submission_files import read_submission, write_submission
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import read_split_file
+from tests.exchange.importers import writers
 from tests.handmade import card_of, full_board, put_board, put_pictures
-from tests.importers import writers
 
 FEW = settings(
     max_examples=8,

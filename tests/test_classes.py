@@ -73,7 +73,7 @@ rules = [{ key = "power", geometry = "area", values = ["plant", "generator"] }]
 DRAW = """
 import sys
 from importlib import resources
-from sasgeo_bench.config import parse_toml
+from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.osm import taxonomy
 text = resources.files("sasgeo_bench.osm").joinpath("taxonomy.toml").read_text(encoding="utf-8")
 known = parse_toml(text + sys.argv[2], taxonomy.Taxonomy, source="grown.toml")

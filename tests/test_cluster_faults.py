@@ -14,8 +14,8 @@ from functools import partial
 import pytest
 
 import sasgeo_bench as sgb
-from sasgeo_bench.errors import StoreError
-from sasgeo_bench.progress import reporting, spread
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.progress import reporting, spread
 
 distributed = pytest.importorskip("distributed", reason="distributed is not installed (make install brings it)")
 dask = pytest.importorskip("dask")
@@ -191,6 +191,6 @@ def test_workers_that_die_over_and_over_end_the_work_with_one_line(monkeypatch):
             return [Future()]
 
     monkeypatch.setattr("distributed.as_completed", iter)
-    monkeypatch.setattr("sasgeo_bench.progress.connected", lambda _: nullcontext(Client()))
+    monkeypatch.setattr("sasgeo_bench.core.progress.connected", lambda _: nullcontext(Client()))
     with pytest.raises(StoreError, match="died over and over on the same item"):
         list(spread(square, range(1), dask="tcp://here:1"))

@@ -17,7 +17,7 @@ import typer
 import sasgeo_bench as sgb
 from docs.site import reference
 from sasgeo_bench.cli import program
-from sasgeo_bench.errors import PerturbError
+from sasgeo_bench.core.errors import PerturbError
 from sasgeo_bench.matching.scaffold import package_files
 from tests.test_repository import markdown_links
 

@@ -17,10 +17,10 @@ import pytest
 import typer
 
 from sasgeo_bench import cli
+from sasgeo_bench.boards.archive import pack_board
+from sasgeo_bench.boards.manifests import PipelineRecord
 from sasgeo_bench.cli import program
-from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.matching.scaffold import package_files
-from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from tests import world
 from tests.threaded import threaded
@@ -51,7 +51,7 @@ ONLY_PARSED = {
     r"--suite aerial|/aerial": "minutes of painting; tests/tasks/suites/test_pictures.py takes small ones",
     r"flight-image": "a minute of painting; tests/tasks/suites/test_flight_image.py flies a short one",
     r"--dask": "needs a scheduler; tests/running does it",
-    r"s3://": "needs a store; tests/files/test_storage.py has one in memory",
+    r"s3://": "needs a store; tests/core/test_storage.py has one in memory",
     r"^sasgeo-bench profile ": "five minutes; tests/running/test_profiling.py does a moment",
     r"^sasgeo-bench enter ": "minutes of drawing; tests/experiments/test_entering.py enters a small board",
     r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",
@@ -59,8 +59,8 @@ ONLY_PARSED = {
     r"^sasgeo-bench read-flight ": "needs a log of the reader's own; tests/cli/test_cli_flights.py reads some",
     r"--train ": "needs a matcher that learns; tests/running does it",
     r"FILE\.json|<hash>": "needs what a matcher has learnt",
-    r"HASH|--query ID": "needs a run or a query of the reader's own; tests/leaderboard/test_board_pictures.py does it",
-    r"out/boards/demo": "needs the board of the demo; tests/publishing/test_publish.py publishes small ones",
+    r"HASH|--query ID": "needs a run or a query of the reader's own; tests/boards/test_board_pictures.py does it",
+    r"out/boards/demo": "needs the board of the demo; tests/boards/test_publish.py publishes small ones",
     r"^sasgeo-bench verify crossfit": "minutes: tests/cli/test_cli_queries.py does it",
     r"^sasgeo-bench (import|locate)-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
     r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",
@@ -78,7 +78,7 @@ OTHERS = {
     r"^python benchmarks/open_numbers\.py ": "minutes; tests/baselines/test_tunable.py tries made-up systems",
     r"^python -m benchmarks\.cross_check_osm ": "needs extracts; tests/osm/test_cross_check.py reads small maps",
     r"^bash findings/NAME\.sh": "needs the package registry, and a name",
-    r"^python -m benchmarks\.related_work docs/results/": "tests/leaderboard/test_results.py prints the same table",
+    r"^python -m benchmarks\.related_work docs/results/": "tests/boards/test_results.py prints the same table",
     r"umask.*secrets\.token_hex": "makes a secret; tests/tasks/test_private_seed.py reads one",
     r"^pip install 'sasgeo-bench\[publish\]'$": "an installation needs the package registry",
 }

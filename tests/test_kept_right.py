@@ -10,7 +10,7 @@ import pytest
 import shapely
 from PIL import Image
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.logs import read_log
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.read import read_extract

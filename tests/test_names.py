@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.config import check_document
-from sasgeo_bench.errors import ConfigError, MatchError
-from sasgeo_bench.files.plugins import MATCHERS, REJECTORS
-from sasgeo_bench.leaderboard.pipeline_spec import ContrastSpec, PipelineFile, list_pipeline_files, read_pipeline_file
+from sasgeo_bench.boards.pipeline_spec import ContrastSpec, PipelineFile, list_pipeline_files, read_pipeline_file
+from sasgeo_bench.core.config import check_document
+from sasgeo_bench.core.errors import ConfigError, MatchError
+from sasgeo_bench.core.plugins import MATCHERS, REJECTORS
+from sasgeo_bench.core.texts import NAME, VERSION
 from sasgeo_bench.matching.matcher import MatcherCard, RejectorCard
 from sasgeo_bench.matching.submission import Card
 from sasgeo_bench.tasks.split import SplitFile
-from sasgeo_bench.texts import NAME, VERSION
-from tests.test_texts import NASTY
+from tests.core.test_texts import NASTY
 
 ROOT = Path(__file__).parents[1]
 SAID = {"name": "mine", "version": "1", "title": "Mine", "source": "original", "ours": "all", "licence": "MIT"}

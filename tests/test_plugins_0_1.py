@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.submission import API, Card
 from sasgeo_bench.running.segmenter_testing import check_segmenter
 from sasgeo_bench.running.testing import check_matcher

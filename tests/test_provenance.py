@@ -6,15 +6,15 @@ from typing import get_args
 
 import pytest
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.tables import column
-from sasgeo_bench.progress import reporting
-from sasgeo_bench.publishing.archive import pack_board
-from sasgeo_bench.publishing.archive_file import unpack_tasks
-from sasgeo_bench.publishing.build import publish
-from sasgeo_bench.publishing.release_files import ReleaseMap, map_record
+from sasgeo_bench.boards.archive import pack_board
+from sasgeo_bench.boards.archive_file import unpack_tasks
+from sasgeo_bench.boards.board import Board
+from sasgeo_bench.boards.publish import publish
+from sasgeo_bench.boards.tables import column
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.progress import reporting
+from sasgeo_bench.exchange.release_files import ReleaseMap, map_record
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region import Provenance
 from sasgeo_bench.regions.region_files import read_manifest

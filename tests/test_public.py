@@ -13,9 +13,9 @@ import sasgeo_baselines
 
 import sasgeo_bench as sgb
 from sasgeo_bench.cli.program import load
-from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.core.errors import SasgeoError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.matching.scaffold import package_files
-from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
 
 ROOT = Path(__file__).parents[1]

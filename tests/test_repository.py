@@ -183,10 +183,10 @@ def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: 
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     names = set(zipfile.ZipFile(wheel).namelist())
     files = ("py.typed", "__init__.pyi", "osm/taxonomy.toml", "ageing/ratebook.toml", "cli/program.py")
-    files += ("importers/regional_extracts.toml",)
+    files += ("exchange/importers/regional_extracts.toml",)
     expected = {f"sasgeo_bench/{name}" for name in files}
-    templates = (ROOT / "sasgeo_bench" / "publishing" / "templates").iterdir()
-    expected |= {f"sasgeo_bench/publishing/templates/{path.name}" for path in templates}
+    templates = (ROOT / "sasgeo_bench" / "boards" / "templates").iterdir()
+    expected |= {f"sasgeo_bench/boards/templates/{path.name}" for path in templates}
     for folder in SHIPPED:
         expected |= {f"sasgeo_bench/shipped/{folder}/{path.name}" for path in (ROOT / folder).iterdir()}
     assert expected - names == set()

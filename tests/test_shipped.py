@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.config import shipped_dir
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import shipped_dir
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.prediction_files import RUN, RunManifest

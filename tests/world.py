@@ -4,8 +4,8 @@
 from pathlib import Path
 from typing import Any
 
-from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.scored import ScoreRequest
+from sasgeo_bench.boards.build import make_board
+from sasgeo_bench.boards.scored import ScoreRequest
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, read_region_file
 from sasgeo_bench.running.plan import RunRequest, plan_run

@@ -10,7 +10,7 @@ from typing import Final
 
 import shapely
 
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_files import read_region

@@ -15,12 +15,8 @@ import pyarrow as pa
 import typer
 from pydantic import BaseModel
 
-from sasgeo_bench.cli import program
-from sasgeo_bench.files.parquet import read_frame
-from sasgeo_bench.files.plugins import MATCHERS, REJECTORS, SEGMENTERS, list_entry_points
-from sasgeo_bench.geometry.pose import Prior
-from sasgeo_bench.leaderboard.board_files import BOARD, SCHEMAS
-from sasgeo_bench.leaderboard.pipeline_spec import (
+from sasgeo_bench.boards.board_files import BOARD, SCHEMAS
+from sasgeo_bench.boards.pipeline_spec import (
     ContrastSpec,
     LearningSpec,
     PaperSpec,
@@ -29,13 +25,17 @@ from sasgeo_bench.leaderboard.pipeline_spec import (
     find_pipeline_file,
     read_pipeline_file,
 )
-from sasgeo_bench.leaderboard.tables import MARKS, MEANINGS, TERMS
+from sasgeo_bench.boards.tables import MARKS, MEANINGS, TERMS
+from sasgeo_bench.cli import program
+from sasgeo_bench.core.parquet import read_frame
+from sasgeo_bench.core.plugins import MATCHERS, REJECTORS, SEGMENTERS, list_entry_points
+from sasgeo_bench.core.progress import duration_text
+from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import Card, Submission
 from sasgeo_bench.osm.features import DTYPES
 from sasgeo_bench.osm.locate import Extract, TownEntry
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import duration_text
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES
 from sasgeo_bench.regions.region import Manifest, Provenance
@@ -53,17 +53,16 @@ RESULTS: Final = Path(__file__).parents[1] / "results"  # stored boards
 # Headings of the API pages, by the folder that a public name comes from.
 STAGES: Final = {
     "cli": "Stages as functions",
-    "texts": "Bounds of an answer",
+    "core": "Errors, and bounds of an answer",
     "geometry": "Poses and grids",
     "osm": "OpenStreetMap features",
     "regions": "Regions and evidence",
     "search": "Dense pose search",
     "sensing": "Aerial images and segmentation",
     "tasks": "Queries and truths",
-    "datasets": "Datasets of PyTorch",
     "matching": "Matchers, rejectors and segmenters",
     "running": "Predictions and conformance",
-    "leaderboard": "Boards and queries in a notebook",
+    "boards": "Boards and queries in a notebook",
 }
 _MODELS: Final[dict[str, tuple[str, Mapping[str, type[BaseModel]]]]] = {
     "Region file": (

@@ -7,7 +7,7 @@ Draws the region if it is not there, and writes OUT/paper-decoys.parquet and OUT
 import argparse
 from pathlib import Path
 
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_paper import made_paper_task, make_paper_task
 from sasgeo_paper.decoys import decoys_frame, decoys_markdown, every_reading

@@ -11,10 +11,10 @@ from typing import Final
 
 import pandas as pd
 
-from sasgeo_bench.leaderboard.board_files import Extra
-from sasgeo_bench.leaderboard.scored import Scored
-from sasgeo_bench.leaderboard.tables import p_text
-from sasgeo_bench.leaderboard.text import markdown_table
+from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.boards.scored import Scored
+from sasgeo_bench.boards.tables import p_text
+from sasgeo_bench.boards.text import markdown_table
 from sasgeo_bench.scoring.compare import Finding
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.sheet import Panel, panels_of

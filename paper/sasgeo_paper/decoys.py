@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from sasgeo_bench.leaderboard.text import markdown_table
+from sasgeo_bench.boards.text import markdown_table
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, cell_offsets_m
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.scoring.intervals import (

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import GREY, Page, page, panels, without_ticks
+from sasgeo_bench.core.canvas import GREY, Page, page, panels, without_ticks
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.preview import class_keys
 from sasgeo_bench.tasks.sheet import HIDDEN, Panel, paint

@@ -7,7 +7,7 @@ from typing import Final, get_args
 
 import pandas as pd
 
-from sasgeo_bench.leaderboard.pipeline_spec import Crop, paper_suite
+from sasgeo_bench.boards.pipeline_spec import Crop, paper_suite
 from sasgeo_bench.scoring.contrasts import Contrast, mean_finding
 from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_paper.tables import METRICS, PUBLISHED

@@ -13,14 +13,14 @@ from typing import Final
 import numpy as np
 import shapely
 
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.boards.pipeline_spec import PAPER_SUITE, Crop, PaperSpec, paper_suite
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import to_lonlat
-from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, Crop, PaperSpec, paper_suite
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.osm.read import Reading
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_made
 from sasgeo_bench.regions.evidence import PRESENT

@@ -8,8 +8,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.boards.pipeline_spec import Crop
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.leaderboard.pipeline_spec import Crop
 from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, hide

@@ -12,12 +12,12 @@ import pandas as pd
 from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, MATCH_IOU, NEAR_M, REDRAWN_M, Ageing
 from sasgeo_bench.ageing.plots import draw_ageing
 from sasgeo_bench.ageing.ratebook import VERSION
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.parquet import read_frame, write_frame
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.parquet import read_frame, write_frame
+from sasgeo_bench.core.texts import markdown, markdown_item, quoted
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.texts import markdown, markdown_item, quoted
 
 TABLE: Final = "ageing.parquet"
 
@@ -70,7 +70,7 @@ def read_ageing(folder: Path) -> Ageing:
     >>> read_ageing(Path("nowhere"))
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.StoreError: nowhere holds no ageing.parquet: run measure-ageing with --out nowhere first
+    sasgeo_bench.core.errors.StoreError: nowhere holds no ageing.parquet: run measure-ageing with --out nowhere first
     """
     path = folder / TABLE
     if not path.is_file():

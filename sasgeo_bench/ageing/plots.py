@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from sasgeo_bench.ageing.measure import Ageing
-from sasgeo_bench.canvas import Page, page
+from sasgeo_bench.core.canvas import Page, page
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import ATTRIBUTION
 

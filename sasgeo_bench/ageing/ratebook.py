@@ -12,8 +12,8 @@ from typing import Annotated, Final
 import numpy as np
 from pydantic import Field, field_validator
 
-from sasgeo_bench.config import Document, parse_toml
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import Document, parse_toml
+from sasgeo_bench.core.errors import ConfigError
 
 VERSION: Final = 2  # of the file: 1 had no rates of ground
 LEAST_THINGS: Final = 20  # a rate of fewer things is too uncertain

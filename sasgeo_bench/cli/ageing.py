@@ -11,7 +11,7 @@ from sasgeo_bench.ageing.files import read_ageing, write_ageing, write_ratebook,
 from sasgeo_bench.ageing.measure import measure_ageing
 from sasgeo_bench.cli.console import read_day, say
 from sasgeo_bench.cli.options import Options
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.history import MARGIN_M, date_extracts, read_history
 from sasgeo_bench.osm.scan import Box
 

@@ -8,18 +8,13 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress
-from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
-from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.experiments.head_start import packed_for, unpack_head_start
-from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
-from sasgeo_bench.experiments.sealed import check_day
-from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.manifests import SeedRecord
-from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
-from sasgeo_bench.leaderboard.private_board import check_public, read_private
-from sasgeo_bench.leaderboard.text import (
+from sasgeo_bench.boards.archive import board_of, request_of, score_all
+from sasgeo_bench.boards.archive_file import is_pack
+from sasgeo_bench.boards.board import Board
+from sasgeo_bench.boards.manifests import SeedRecord
+from sasgeo_bench.boards.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
+from sasgeo_bench.boards.private_board import check_public, read_private
+from sasgeo_bench.boards.text import (
     TERMINAL,
     Contents,
     control_lines,
@@ -30,10 +25,15 @@ from sasgeo_bench.leaderboard.text import (
     tables_of,
     warnings_of,
 )
-from sasgeo_bench.progress import tell
-from sasgeo_bench.publishing.archive import board_of, request_of, score_all
-from sasgeo_bench.publishing.archive_file import is_pack
-from sasgeo_bench.publishing.submissions import submissions_for
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress
+from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, RegionFolders, takes
+from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
+from sasgeo_bench.core.errors import ConfigError, StoreError, counted
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.exchange.submissions import submissions_for
+from sasgeo_bench.experiments.head_start import packed_for, unpack_head_start
+from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.running.failures import log_beside
 from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.tasks.task_files import TRUTH

@@ -21,9 +21,9 @@ from rich.progress import Progress as RichProgress
 from rich.table import Table
 from rich.text import Text
 
-from sasgeo_bench import progress
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.texts import plain, plain_lines
+from sasgeo_bench.core import progress
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.texts import plain, plain_lines
 
 EXIT_USER: Final = 2  # exit status
 CONTESTANT_FAILED: Final = 4

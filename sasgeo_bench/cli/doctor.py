@@ -16,7 +16,7 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table
 from sasgeo_bench.cli.options import ExtractFolders, Out
-from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.core.errors import ExtractError
 from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, Extract, answers, extract_folders, find_extract
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 

@@ -16,8 +16,8 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, complain, print_table, say
 from sasgeo_bench.cli.options import RegionFolders
-from sasgeo_bench.errors import ConfigError, MatchError, counted
-from sasgeo_bench.files.plugins import (
+from sasgeo_bench.core.errors import ConfigError, MatchError, counted
+from sasgeo_bench.core.plugins import (
     MATCHERS,
     METRICS,
     ORACLE,
@@ -30,8 +30,8 @@ from sasgeo_bench.files.plugins import (
     list_entry_points,
     unknown,
 )
-from sasgeo_bench.progress import tell
-from sasgeo_bench.texts import one_line, plain
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import one_line, plain
 
 _OF_DEMO: Final = "demo-"  # too many made-up towns to list
 
@@ -159,7 +159,7 @@ def _list(kind: str, door: _Door) -> None:
 
 
 def _list_regions(folders: Iterable[Path] | None) -> None:
-    from sasgeo_bench.config import shipped_dir  # noqa: PLC0415
+    from sasgeo_bench.core.config import shipped_dir  # noqa: PLC0415
     from sasgeo_bench.regions.region_spec import list_region_files, read_region_file  # noqa: PLC0415
 
     table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)

@@ -7,16 +7,16 @@ from typing import Annotated
 
 import typer
 
+from sasgeo_bench.boards.elsewhere import elsewhere_lines
 from sasgeo_bench.cli.boards import check_controls, show_board
 from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.exchange.submissions import SubmitRequest, make_submission
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, failure_lines, plan_entry
 from sasgeo_bench.matching.submission import example_card
-from sasgeo_bench.progress import tell
-from sasgeo_bench.publishing.elsewhere import elsewhere_lines
-from sasgeo_bench.publishing.submissions import SubmitRequest, make_submission
 
 
 def submit_command(

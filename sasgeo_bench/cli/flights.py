@@ -13,9 +13,10 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Options
-from sasgeo_bench.errors import FlightError, counted
-from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.parquet import write_frame
+from sasgeo_bench.core.errors import FlightError, counted
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.parquet import write_frame
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, fit_profile, measure_drift, pair_run
 from sasgeo_bench.flights.drift_profile import write_drift_profile
 from sasgeo_bench.flights.log_points import FlightLog, steps_m
@@ -23,7 +24,6 @@ from sasgeo_bench.flights.log_units import SPEED_MPS, AngleUnit, HeightUnit, Log
 from sasgeo_bench.flights.logs import gaps_of, is_tum, read_flight, read_log, read_poses
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M
 from sasgeo_bench.flights.trajectory import Axes, Trajectory, read_tum, write_tum
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region_files import read_region
 
 AxesFlag = Annotated[

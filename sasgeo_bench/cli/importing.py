@@ -9,11 +9,11 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out, RegionFolders
-from sasgeo_bench.errors import counted, named
-from sasgeo_bench.importers.items import Dataset, Role
-from sasgeo_bench.importers.kinds import IMPORTERS, read_dataset
-from sasgeo_bench.importers.reports import Report
-from sasgeo_bench.progress import tell
+from sasgeo_bench.core.errors import counted, named
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.exchange.importers.items import Dataset, Role
+from sasgeo_bench.exchange.importers.kinds import IMPORTERS, read_dataset
+from sasgeo_bench.exchange.importers.reports import Report
 
 Folder = Annotated[Path, typer.Argument(help="folder of the dataset; it is only read")]
 Kind = Annotated[str, typer.Option(help=f"kind of the dataset: {', '.join(IMPORTERS)}")]
@@ -30,10 +30,10 @@ def import_dataset_command(
     out: Out = Path("out"),
 ) -> None:
     """List queries and gallery of another benchmark's dataset, and score a ranking of them: OUT/datasets/KIND."""
-    from sasgeo_bench.files.folders import sha256_of  # noqa: PLC0415
-    from sasgeo_bench.importers.reports import score_ranking  # noqa: PLC0415
-    from sasgeo_bench.importers.retrieval import read_ranking  # noqa: PLC0415
-    from sasgeo_bench.importers.tables import import_folder, write_items, write_reports  # noqa: PLC0415
+    from sasgeo_bench.core.folders import sha256_of  # noqa: PLC0415
+    from sasgeo_bench.exchange.importers.reports import score_ranking  # noqa: PLC0415
+    from sasgeo_bench.exchange.importers.retrieval import read_ranking  # noqa: PLC0415
+    from sasgeo_bench.exchange.importers.tables import import_folder, write_items, write_reports  # noqa: PLC0415
 
     dataset = _read(folder, kind)
     target = import_folder(out, dataset, source=folder)
@@ -47,7 +47,7 @@ def import_dataset_command(
 
 def locate_dataset_command(folder: Folder, *, kind: Kind, regions: RegionFolders = None) -> None:
     """Say where a dataset lies, and which OpenStreetMap extracts cover it."""
-    from sasgeo_bench.importers.reader import find_extents  # noqa: PLC0415
+    from sasgeo_bench.exchange.importers.reader import find_extents  # noqa: PLC0415
 
     extents = find_extents(_read(folder, kind), folders=regions or ())
     table = Table("area", "items", "center_lonlat", "km", "west,south,east,north", box=None, pad_edge=False)

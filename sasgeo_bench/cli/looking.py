@@ -10,17 +10,17 @@ import pandas as pd
 import typer
 from rich.table import Table
 
+from sasgeo_bench.boards.board_files import BOARD, read_board_manifest, read_scores
+from sasgeo_bench.boards.cases import case_pixels, count_cases, sample_cases, write_png
+from sasgeo_bench.boards.flight_plots import flight_map_pixels
+from sasgeo_bench.boards.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
+from sasgeo_bench.boards.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
-from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest, read_scores
-from sasgeo_bench.leaderboard.cases import case_pixels, count_cases, sample_cases, write_png
-from sasgeo_bench.leaderboard.flight_plots import flight_map_pixels
-from sasgeo_bench.leaderboard.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
-from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
+from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest

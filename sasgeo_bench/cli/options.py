@@ -15,10 +15,10 @@ from typing import Annotated, Any, Final, ParamSpec, TypeVar, cast, get_args, ge
 import typer
 from typer.models import ParameterInfo
 
-from sasgeo_bench.errors import ConfigError, check_given
-from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.progress import Progress, Tell, reporting, silent
-from sasgeo_bench.texts import one_line
+from sasgeo_bench.core.errors import ConfigError, check_given
+from sasgeo_bench.core.paths import given_path
+from sasgeo_bench.core.progress import Progress, Tell, reporting, silent
+from sasgeo_bench.core.texts import one_line
 
 Words = ParamSpec("Words")
 Result = TypeVar("Result")
@@ -115,7 +115,7 @@ def takes(options: Callable[Words, Object]) -> Callable[[Callable[[Object], Resu
     >>> walk(tasks=[], jobs=0)
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: jobs must be at least 1, got 0
+    sasgeo_bench.core.errors.ConfigError: jobs must be at least 1, got 0
     """
 
     def decorate(function: Callable[[Object], Result]) -> Callable[Words, Result]:

@@ -18,9 +18,9 @@ from typer.core import TyperGroup
 from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say
 from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, exit_interrupted, is_interrupt
 from sasgeo_bench.cli.options import with_flags
-from sasgeo_bench.errors import SasgeoError
-from sasgeo_bench.progress import QUIET, tell
-from sasgeo_bench.texts import one_line
+from sasgeo_bench.core.errors import SasgeoError
+from sasgeo_bench.core.progress import QUIET, tell
+from sasgeo_bench.core.texts import one_line
 
 HELP: Final = (
     "Build regions from OpenStreetMap extracts, draw queries, run matchers, score them, publish boards. Results go to "

@@ -7,23 +7,23 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench import progress
+from sasgeo_bench.boards import publish as build
+from sasgeo_bench.boards.archive import board_of
+from sasgeo_bench.boards.board import Board
+from sasgeo_bench.boards.site_files import Written
 from sasgeo_bench.cli.boards import check_controls
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
-from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.core import progress
+from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.paths import given_path
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.storage import Moved, fetch, send, shown
+from sasgeo_bench.exchange.release import ReleaseRequest, check_place, make_release
+from sasgeo_bench.exchange.release_files import BoardTasks
+from sasgeo_bench.exchange.submissions import with_submissions
 from sasgeo_bench.experiments.board_queries import BoardRequest, draw_board
-from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.files.storage import Moved, fetch, send, shown
-from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.progress import tell
-from sasgeo_bench.publishing import build
-from sasgeo_bench.publishing.archive import board_of
-from sasgeo_bench.publishing.release import ReleaseRequest, check_place, make_release
-from sasgeo_bench.publishing.release_files import BoardTasks
-from sasgeo_bench.publishing.site_files import Written
-from sasgeo_bench.publishing.submissions import with_submissions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,8 +67,8 @@ def publish(options: PublishOptions) -> Written:
     >>> sgb.publish(board="out/boards/demo", into="out/boards/demo/figures")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.StoreError: out/boards/demo/figures is the board itself, or would be a strange folder in it: \
-name another one with --into
+    sasgeo_bench.core.errors.StoreError: out/boards/demo/figures is the board itself, or would be a strange folder in \
+it: name another one with --into
     """
     written, board = _published(options)
     for name, why in board.about.failed.items() if board else ():

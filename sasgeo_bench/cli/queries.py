@@ -12,9 +12,9 @@ import typer
 from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, OwnRegionFolders, takes
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import reported, spread, tell
 from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
 from sasgeo_bench.tasks.query import PROFILE, Detector, PriorGroup

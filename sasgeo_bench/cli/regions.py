@@ -11,7 +11,7 @@ import typer
 
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.progress import reported, spread
+from sasgeo_bench.core.progress import reported, spread
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
@@ -130,7 +130,7 @@ def render_imagery(options: RenderOptions) -> tuple[Path, ...]:
     >>> sgb.render_imagery(["town-grid"], season="monsoon")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: season is one of spring, summer, autumn, winter, snow, got 'monsoon'
+    sasgeo_bench.core.errors.ConfigError: season is one of spring, summer, autumn, winter, snow, got 'monsoon'
     """
     from sasgeo_bench.sensing.reference_imagery import Look, render_place  # noqa: PLC0415 - build-region needs none
 

@@ -9,12 +9,12 @@ from typing import Annotated, Final
 
 import typer
 
+from sasgeo_bench.boards.profile_page import PAGE, check_profile, facts, write_profile
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress
 from sasgeo_bench.cli.options import Dask, Options, Out, RegionFolders, takes
-from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.matching.matcher import SOUND
-from sasgeo_bench.progress import tell
-from sasgeo_bench.publishing.profile_page import PAGE, check_profile, facts, write_profile
 from sasgeo_bench.running import runner
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.prediction_files import merge_runs

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.progress import tell
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.tasks.private_seed import (
     LEAST_BITS,
     REPRODUCING_BITS,

@@ -6,9 +6,9 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Final
 
-from sasgeo_bench.errors import ConfigError, named
-from sasgeo_bench.leaderboard.board_files import BOARD
-from sasgeo_bench.leaderboard.run_cases import is_run
+from sasgeo_bench.boards.board_files import BOARD
+from sasgeo_bench.boards.run_cases import is_run
+from sasgeo_bench.core.errors import ConfigError, named
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.regions.region_spec import list_region_files
 from sasgeo_bench.running.prediction_files import RUN

@@ -7,14 +7,14 @@ from typing import Annotated, Final
 
 import typer
 
+from sasgeo_bench.boards.archive import laid_tasks
+from sasgeo_bench.boards.run_cases import is_run
 from sasgeo_bench.cli.console import EXIT_USER, complain, say, shown_progress
 from sasgeo_bench.cli.options import Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
-from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.leaderboard.run_cases import is_run
-from sasgeo_bench.progress import spread, tell
-from sasgeo_bench.publishing.archive import laid_tasks
-from sasgeo_bench.publishing.submissions import hold_submission
+from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.progress import spread, tell
+from sasgeo_bench.exchange.submissions import hold_submission
 from sasgeo_bench.regions.region_files import differing_files, read_features
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running.prediction_files import Violation, parts_of

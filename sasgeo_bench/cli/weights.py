@@ -12,7 +12,7 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.cards import WHERE, read_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Region

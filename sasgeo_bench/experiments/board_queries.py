@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.boards.archive import laid_tasks
+from sasgeo_bench.boards.archive_file import is_pack, read_pack
+from sasgeo_bench.boards.board_files import read_board_manifest
+from sasgeo_bench.boards.manifests import BoardManifest
+from sasgeo_bench.boards.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
+from sasgeo_bench.core.errors import ConfigError, StoreError, counted
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.exchange.release_files import BoardTasks
 from sasgeo_bench.experiments.entry_cost import fetch_extracts
 from sasgeo_bench.experiments.pipeline import PipelinePlan, draw_all, plan_pipeline
-from sasgeo_bench.leaderboard.board_files import read_board_manifest
-from sasgeo_bench.leaderboard.manifests import BoardManifest
-from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
-from sasgeo_bench.progress import tell
-from sasgeo_bench.publishing.archive import laid_tasks
-from sasgeo_bench.publishing.archive_file import is_pack, read_pack
-from sasgeo_bench.publishing.release_files import BoardTasks
 from sasgeo_bench.regions.build import package_version
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.tasks.private_seed import PrivateSeed

@@ -8,29 +8,29 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Final, NamedTuple
 
-from sasgeo_bench.config import LONGEST_LINE, check_document
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
-from sasgeo_bench.experiments import entry_cost
-from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, plan_board, same_queries
-from sasgeo_bench.experiments.pipeline import PipelinePlan, Run, ask, draw_all, plan_runs
-from sasgeo_bench.files.plugins import check_registered
-from sasgeo_bench.leaderboard.scored import Scored
-from sasgeo_bench.matching.matcher import SOUND, MatcherCard, Prediction
-from sasgeo_bench.matching.submission import NONE, Card
-from sasgeo_bench.progress import tell
-from sasgeo_bench.publishing.archive_file import read_pack
-from sasgeo_bench.publishing.submissions import (
+from sasgeo_bench.boards.archive_file import read_pack
+from sasgeo_bench.boards.scored import Scored
+from sasgeo_bench.core.config import LONGEST_LINE, check_document
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError, counted
+from sasgeo_bench.core.plugins import check_registered
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import one_line
+from sasgeo_bench.exchange.submissions import (
     SubmitRequest,
     beside_stored,
     check_card,
     default_folder,
     make_submission,
 )
+from sasgeo_bench.experiments import entry_cost
+from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, plan_board, same_queries
+from sasgeo_bench.experiments.pipeline import PipelinePlan, Run, ask, draw_all, plan_runs
+from sasgeo_bench.matching.matcher import SOUND, MatcherCard, Prediction
+from sasgeo_bench.matching.submission import NONE, Card
 from sasgeo_bench.running.plan import RunPlan
 from sasgeo_bench.running.prediction_files import begin_round, end_round, open_round, read_predictions
 from sasgeo_bench.scoring.submission_files import check_submission_folder, is_submission, read_submission
 from sasgeo_bench.tasks.split import HALVES, Split
-from sasgeo_bench.texts import one_line
 
 _WITHOUT: Final = "; or leave their regions out by --without, which counts as misses"
 _LIKE: Final = 0.7  # names that are more alike are taken for a slip of the pen

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from sasgeo_bench.errors import ConfigError, ExtractError, StoreError, counted
+from sasgeo_bench.boards.archive_file import RUNS
+from sasgeo_bench.boards.board_files import MEND, read_board_manifest, read_scores
+from sasgeo_bench.core.errors import ConfigError, ExtractError, StoreError, counted
+from sasgeo_bench.core.parquet import read_table
+from sasgeo_bench.core.progress import duration_text
 from sasgeo_bench.experiments.pipeline import PipelinePlan
-from sasgeo_bench.files.parquet import read_table
-from sasgeo_bench.leaderboard.board_files import MEND, read_board_manifest, read_scores
 from sasgeo_bench.matching.matcher import is_followed
 from sasgeo_bench.osm.locate import FOLDERS_VARIABLE, find_extract, find_parts, missing_files
-from sasgeo_bench.progress import duration_text
-from sasgeo_bench.publishing.archive_file import RUNS
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunPlan
 from sasgeo_bench.scoring.rows import is_unranked

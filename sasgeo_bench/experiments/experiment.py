@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.files.plugins import EXPERIMENTS, find_plugin, list_entry_points
-from sasgeo_bench.leaderboard.board_files import Extra
-from sasgeo_bench.leaderboard.pipeline_spec import PaperSpec, PipelineFile
-from sasgeo_bench.leaderboard.scored import Scored
+from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.boards.pipeline_spec import PaperSpec, PipelineFile
+from sasgeo_bench.boards.scored import Scored
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.plugins import EXPERIMENTS, find_plugin, list_entry_points
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 
 _PAPER = "paper"  # entry point, and table of a pipeline file

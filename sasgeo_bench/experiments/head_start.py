@@ -16,15 +16,15 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from sasgeo_bench.errors import SasgeoError, StoreError, counted
-from sasgeo_bench.files.folders import locked, remove_tree
-from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
-from sasgeo_bench.progress import tell
+from sasgeo_bench.boards.pipeline_spec import ArchiveSpec
+from sasgeo_bench.core.errors import SasgeoError, StoreError, counted
+from sasgeo_bench.core.folders import locked, remove_tree
+from sasgeo_bench.core.json import parse_json
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.running.leak_scan import PACKED
 from sasgeo_bench.running.prediction_files import RUN, mark_packed
-from sasgeo_bench.texts import one_line
 
 FOLDER: Final = "runs"  # below the root of what is built
 MOST_PACKED: Final = 50_000_000  # bytes of an archive,

@@ -12,16 +12,16 @@ from typing import Final
 
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted, named
+from sasgeo_bench.boards.archive import pack_board
+from sasgeo_bench.boards.archive_file import check_results
+from sasgeo_bench.boards.build import drawings, make_board
+from sasgeo_bench.boards.pipeline_spec import LearningSpec, PipelineFile
+from sasgeo_bench.boards.scored import Scored, ScoreRequest
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError, counted, named
+from sasgeo_bench.core.plugins import ORACLE, YARDSTICK, check_names, is_tracker
+from sasgeo_bench.core.progress import reporting, silent, tell
 from sasgeo_bench.experiments.experiment import Experiment, find_experiment
 from sasgeo_bench.experiments.sealed import Seal, open_seal, seal_of
-from sasgeo_bench.files.plugins import ORACLE, YARDSTICK, check_names, is_tracker
-from sasgeo_bench.leaderboard.build import drawings, make_board
-from sasgeo_bench.leaderboard.pipeline_spec import LearningSpec, PipelineFile
-from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
-from sasgeo_bench.progress import reporting, silent, tell
-from sasgeo_bench.publishing.archive import pack_board
-from sasgeo_bench.publishing.archive_file import check_results
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures, log_beside

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
+from sasgeo_bench.boards.board_files import BOARD, read_board_manifest
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.tasks.private_seed import (
     Opening,
     Openings,

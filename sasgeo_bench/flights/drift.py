@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import chi2
 
-from sasgeo_bench.config import check_document
-from sasgeo_bench.errors import FlightError, counted
+from sasgeo_bench.core.config import check_document
+from sasgeo_bench.core.errors import FlightError, counted
 from sasgeo_bench.flights.drift_profile import DriftProfile, Dropouts, HeadingDrift, Resets, ScaleDrift, SlipDrift
 from sasgeo_bench.flights.odometry import heading_law, lattice_covariance, lattice_heading, path_steps_m
 from sasgeo_bench.flights.trajectory import Trajectory

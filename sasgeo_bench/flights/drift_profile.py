@@ -9,11 +9,11 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from sasgeo_bench.config import Document, Line, Prose, parse_toml
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.texts import NAME
+from sasgeo_bench.core.config import Document, Line, Prose, parse_toml
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.texts import NAME
 
 _FOLDER: Final = "profiles"
 _MOST_BYTES: Final = 100_000

@@ -21,10 +21,10 @@ from defusedxml import DefusedXmlException  # type: ignore[import-untyped]
 from defusedxml.ElementTree import iterparse  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import FlightError, counted
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.errors import FlightError, counted
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.texts import message_of, plain
 from sasgeo_bench.flights.log_units import FASTEST_MPS, HIGHEST_M
-from sasgeo_bench.texts import message_of, plain
 
 Floats = NDArray[np.float64]
 

@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.core.texts import message_of, plain
 from sasgeo_bench.flights.log_formats import (
     NUMBERING,
     PX4,
@@ -33,7 +34,6 @@ from sasgeo_bench.flights.log_formats import (
 )
 from sasgeo_bench.flights.log_points import BEFORE_FIX, FlightLog, LogSource, shown, tell_left_out
 from sasgeo_bench.flights.log_units import UNITS, WORDS, LogFacts, choices_of
-from sasgeo_bench.texts import message_of, plain
 
 _DAY_S: Final = 86_400.0
 _WEEK_S: Final = 604_800.0

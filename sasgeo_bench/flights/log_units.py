@@ -7,9 +7,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Literal
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.trajectory import AXES, Axes
-from sasgeo_bench.texts import plain
 
 TimeUnit = Literal["s", "ms", "us", "ns", "none"]
 HeightUnit = Literal["m", "cm", "mm", "ft", "none"]
@@ -130,7 +130,7 @@ def check_within(option: str, value: float | None) -> None:
     >>> check_within("--height-m", float("nan"))
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.FlightError: --height-m must be a number from 5 to 10000, got nan
+    sasgeo_bench.core.errors.FlightError: --height-m must be a number from 5 to 10000, got nan
     """
     least, most = RANGES[option]
     if value is not None and not least <= value <= most:

@@ -11,7 +11,9 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
 from sasgeo_bench.flights.log_table import read_csv
 from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
@@ -19,9 +21,7 @@ from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.geometry.projection import from_lonlat
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.texts import plain
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.drift_profile import DriftProfile
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import reckon, wrap_deg

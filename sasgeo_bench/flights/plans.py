@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.kinematics import DEFAULT_LIMITS, Limits, length_m, round_corners
 from sasgeo_bench.geometry.pose import wrap_deg
 from sasgeo_bench.osm.taxonomy import load_taxonomy

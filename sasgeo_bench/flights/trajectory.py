@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from sasgeo_bench.errors import FlightError
-from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import bearing_deg
-from sasgeo_bench.texts import plain
 
 Floats = NDArray[np.float64]
 

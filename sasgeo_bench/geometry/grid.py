@@ -9,7 +9,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import GridError
+from sasgeo_bench.core.errors import GridError
 
 Points = NDArray[np.float64]
 

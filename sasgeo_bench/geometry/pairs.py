@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
 
 Ints = NDArray[np.int64]
 Shapes = NDArray[np.object_]

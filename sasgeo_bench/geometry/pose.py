@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sasgeo_bench.errors import PoseError
-from sasgeo_bench.texts import BOUNDS, bounds_text
+from sasgeo_bench.core.errors import PoseError
+from sasgeo_bench.core.texts import BOUNDS, bounds_text
 
 
 def normalize_deg(angle_deg: ArrayLike) -> NDArray[np.float64]:

@@ -6,14 +6,14 @@ from typing import Annotated, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Strict
 
-from sasgeo_bench import config
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.paths import given_path, plain_file, read_bounded
-from sasgeo_bench.files.plugins import CARD_FILE
+from sasgeo_bench.core import config
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.paths import given_path, plain_file, read_bounded
+from sasgeo_bench.core.plugins import CARD_FILE
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.matching.matcher import MOST_LEARNED_BYTES, MatcherCard, check_learned
 from sasgeo_bench.matching.submission import Card
-from sasgeo_bench.texts import one_line
 
 _EXAMPLE: Final = "submit --example-card prints a sound one"
 _MOST_BYTES: Final = 100_000

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.core.texts import MOST_DIAGNOSTICS
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.matching.controls import reckoning
@@ -20,7 +21,6 @@ from sasgeo_bench.matching.matcher import MOST_SAID, Match, Matcher, MatcherCard
 from sasgeo_bench.matching.tracker import SIDE, Fix
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import Query, Step
-from sasgeo_bench.texts import MOST_DIAGNOSTICS
 
 _VERSION: Final = 2
 _SAID: Final = (

@@ -13,11 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from sasgeo_bench.errors import MatchError
-from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.regions.region import Region
-from sasgeo_bench.tasks.query import Head, Query, Track, Truth
-from sasgeo_bench.texts import (
+from sasgeo_bench.core.errors import MatchError
+from sasgeo_bench.core.texts import (
     BOUNDS,
     MOST_CANDIDATES,
     MOST_DIAGNOSTICS,
@@ -28,6 +25,9 @@ from sasgeo_bench.texts import (
     is_line,
     one_line,
 )
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.tasks.query import Head, Query, Track, Truth
 
 FORBID_MORE: Final = ConfigDict(extra="forbid")  # of what a process sends
 
@@ -185,8 +185,8 @@ def check_identity(name: str, version: str) -> None:
     >>> check_identity("graph", "=1+1")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.MatchError: card: version '=1+1' may hold letters, digits, dots, hyphens, underscores and plus
-    signs only, a letter or digit first, 60 at most
+    sasgeo_bench.core.errors.MatchError: card: version '=1+1' may hold letters, digits, dots, hyphens, underscores and
+    plus signs only, a letter or digit first, 60 at most
     """
     for what, value, pattern, letters in (
         ("name", name, NAME, "lower-case letters, digits, hyphens and underscores"),

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from sasgeo_bench.errors import MatchError
-from sasgeo_bench.files.plugins import (
+from sasgeo_bench.core.errors import MatchError
+from sasgeo_bench.core.plugins import (
     KINDS,
     MATCHERS,
     REJECTORS,
@@ -18,7 +18,7 @@ from sasgeo_bench.files.plugins import (
     made,
     unknown,
 )
-from sasgeo_bench.texts import message_of, one_line
+from sasgeo_bench.core.texts import message_of, one_line
 
 if TYPE_CHECKING:
     from sasgeo_bench.matching.matcher import Matcher, Rejector
@@ -34,7 +34,8 @@ def load_matcher(spec: str) -> "Matcher":
     >>> load_matcher("no_such_matcher")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.MatchError: there is no matcher 'no_such_matcher' (list matchers shows all; or module:Class)
+    sasgeo_bench.core.errors.MatchError: there is no matcher 'no_such_matcher' (list matchers shows all; or
+    module:Class)
     """
     from sasgeo_bench.matching.matcher import MatcherCard  # noqa: PLC0415 - names are listed without it
 
@@ -78,7 +79,7 @@ def load_segmenter(spec: str) -> "Segmenter":
     >>> load_segmenter("no_such_segmenter")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.MatchError: there is no segmenter 'no_such_segmenter' (list segmenters shows all; or
+    sasgeo_bench.core.errors.MatchError: there is no segmenter 'no_such_segmenter' (list segmenters shows all; or
     module:Class)
     """
     from sasgeo_bench.matching.segmenter import SegmenterCard  # noqa: PLC0415 - as in load_matcher

@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugins import (
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.plugins import (
     CARD_FILE,
     KINDS,
     MATCHERS,

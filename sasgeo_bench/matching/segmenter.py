@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
-from sasgeo_bench.errors import ImageError, MatchError
+from sasgeo_bench.core.errors import ImageError, MatchError
 from sasgeo_bench.matching.matcher import FORBID_MORE, check_card, check_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage
@@ -146,7 +146,7 @@ def check_segmentation(found: object, image: AerialImage, *, classes: Sequence[s
     >>> check_segmentation("roofs everywhere", tiny_images()[0].image)
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.MatchError: segment() returned str, expected sasgeo_bench.sensing.segmentation.Segmentation
+    sasgeo_bench.core.errors.MatchError: segment() returned str, expected sasgeo_bench.sensing.segmentation.Segmentation
     """
     if not isinstance(found, Segmentation):
         raise MatchError(

@@ -6,11 +6,11 @@ from typing import Annotated, Final
 
 from pydantic import BeforeValidator, Field, field_validator
 
-from sasgeo_bench.config import Document, Line, Short
+from sasgeo_bench.core.config import Document, Line, Short
+from sasgeo_bench.core.texts import FOLDER, NAME, VERSION
 from sasgeo_bench.matching.matcher import Need
 from sasgeo_bench.tasks.query import Track
 from sasgeo_bench.tasks.split import HALVES, Half
-from sasgeo_bench.texts import FOLDER, NAME, VERSION
 
 SCHEMA_VERSION: Final = 1
 API: Final = 1  # version of the doors: what a plugin of it is given, and answers, stays as it is

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import Match, MatcherCard, Prediction, check_match
 from sasgeo_bench.regions.region import Region

@@ -11,9 +11,9 @@ from typing import Any, Final, NamedTuple
 
 import shapely
 
-from sasgeo_bench.errors import ExtractError, counted, named
-from sasgeo_bench.files.json import MOST_BYTES, parse_json
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.errors import ExtractError, counted, named
+from sasgeo_bench.core.json import MOST_BYTES, parse_json
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.osm.multipolygons import MIN_RING_POINTS
 from sasgeo_bench.osm.scan import BUILT_UP, Box, Classifier, Get, Scan, ScanRow
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy

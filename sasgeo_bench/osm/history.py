@@ -17,8 +17,9 @@ import osmium
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
-from sasgeo_bench.files.folders import scratch_folder
+from sasgeo_bench.core.errors import ConfigError, CoverageError, ExtractError
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat
 from sasgeo_bench.osm.coverage import CLOSE_M
@@ -29,7 +30,6 @@ from sasgeo_bench.osm.read import Reading, read_extract
 from sasgeo_bench.osm.scan import Box, Tally, line_wkb
 from sasgeo_bench.osm.snapshot import OBJECTS, elements, is_history, open_snapshot, own_id, read_header
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import tell
 
 # Prefixes of https://wiki.openstreetmap.org/wiki/Lifecycle_prefix for what is gone, on the keys of our classes.
 _PREFIXES: Final = ("demolished", "razed", "removed", "was", "abandoned", "destroyed")
@@ -236,7 +236,7 @@ def date_extracts(paths: Sequence[Path], *, at: Sequence[dt.date] = ()) -> tuple
     >>> date_extracts([Path("nowhere.osm.pbf")])
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
+    sasgeo_bench.core.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
     """
     histories = [path for path in paths if is_history(path)]
     if histories:

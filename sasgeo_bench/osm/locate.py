@@ -21,10 +21,10 @@ from pydantic import (
     model_validator,
 )
 
-from sasgeo_bench.config import Document, Line
-from sasgeo_bench.errors import ExtractError
-from sasgeo_bench.files.folders import scratch_folder, sha256_of
-from sasgeo_bench.progress import QUIET
+from sasgeo_bench.core.config import Document, Line
+from sasgeo_bench.core.errors import ExtractError
+from sasgeo_bench.core.folders import scratch_folder, sha256_of
+from sasgeo_bench.core.progress import QUIET
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
 IMAGERY_VARIABLE: Final = "SASGEO_IMAGERY"

@@ -14,7 +14,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import CoverageError, ExtractError
+from sasgeo_bench.core.errors import CoverageError, ExtractError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.coverage import FULL_SHARE, LONGEST_M, M_PER_DEG, choose_coverage

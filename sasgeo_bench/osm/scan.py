@@ -14,7 +14,7 @@ import numpy as np
 import osmium
 import shapely
 
-from sasgeo_bench.files.folders import uncollected
+from sasgeo_bench.core.folders import uncollected
 from sasgeo_bench.osm.coverage import find_gaps
 from sasgeo_bench.osm.multipolygons import (
     Kind,

@@ -14,9 +14,9 @@ import numpy as np
 import osmium
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ExtractError, counted
-from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.errors import ExtractError, counted
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.osm.xml_text import NEW_IDS, Box, clean, has_several_streams, needs_cleaning, open_text, read_boxes
 
 SUFFIXES: Final = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osh.pbf", ".osh", ".osh.gz", ".osh.bz2")
@@ -76,7 +76,7 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
     ...     pass
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
+    sasgeo_bench.core.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
     """
     _check_file(path)
     with _readable(path), scratch_folder("map") as scratch:

@@ -12,7 +12,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, StringConstraints, model_validator
 
-from sasgeo_bench.config import Document, parse_toml
+from sasgeo_bench.core.config import Document, parse_toml
 
 Kind = Literal["line", "area"]
 Part = Literal["road", "rail", "water", "building", "area", "none"]

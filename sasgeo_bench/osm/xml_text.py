@@ -13,7 +13,7 @@ from typing import IO, Final, cast
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.paths import plain_file
 
 Box = tuple[float, float, float, float]
 

@@ -20,8 +20,9 @@ import shapely
 from numpy.typing import NDArray
 from scipy import fft
 
-from sasgeo_bench.errors import SasgeoError, StoreError, counted
-from sasgeo_bench.files.folders import file_record, fresh_folder, locked, scratch_folder, sha256_of
+from sasgeo_bench.core.errors import SasgeoError, StoreError, counted
+from sasgeo_bench.core.folders import file_record, fresh_folder, locked, scratch_folder, sha256_of
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.locate import Extract, find_extract, find_parts
@@ -29,7 +30,6 @@ from sasgeo_bench.osm.mapped import lonlat_box
 from sasgeo_bench.osm.read import Reading, read_extract, read_geojson
 from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.imagery import ORTHO, Imagery, OffsetRecord, OrthoRecord, find_imagery

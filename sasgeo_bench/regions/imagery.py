@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sasgeo_bench.config import Document, JsonDocument, Line
-from sasgeo_bench.errors import ImageryError, StoreError
-from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
-from sasgeo_bench.files.geotiff import open_geotiff
+from sasgeo_bench.core.config import Document, JsonDocument, Line
+from sasgeo_bench.core.errors import ImageryError, StoreError
+from sasgeo_bench.core.folders import FileRecord, file_record, sha256_of
+from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, PlainName, Sha256, imagery_folders, named_files
 
@@ -252,7 +252,7 @@ class ImageryEntry(Document):
     `publish` says whether the picture, or what is cut out of it, may be passed on. `empty_rgb` is the colour of areas
     without a picture, in files that say so by no mask. `gsd_m` is a coarser ground resolution than the file has.
 
-    >>> from sasgeo_bench.config import parse_toml
+    >>> from sasgeo_bench.core.config import parse_toml
     >>> text = '''
     ... file = "mosaic.tif"
     ... sha256 = ["0000000000000000000000000000000000000000000000000000000000000000"]
@@ -263,7 +263,7 @@ class ImageryEntry(Document):
     >>> parse_toml(text, ImageryEntry, source="[[imagery]]")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: [[imagery]]: 'publish' is missing
+    sasgeo_bench.core.errors.ConfigError: [[imagery]]: 'publish' is missing
     """
 
     file: PlainName

@@ -27,14 +27,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 from tifffile import TiffFile, TiffPage, TiffWriter
 
-from sasgeo_bench.errors import ImageryError, SasgeoError, StoreError
-from sasgeo_bench.files.geotiff import open_geotiff
+from sasgeo_bench.core.errors import ImageryError, SasgeoError, StoreError
+from sasgeo_bench.core.geotiff import open_geotiff
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.texts import one_line
 
 if TYPE_CHECKING:
     import geopandas as gpd

@@ -20,13 +20,13 @@ from rasterio.errors import CRSError, RasterioError
 from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
-from sasgeo_bench.errors import GridError, ImageryError
-from sasgeo_bench.files.folders import file_record
-from sasgeo_bench.files.geotiff import open_geotiff
+from sasgeo_bench.core.errors import GridError, ImageryError
+from sasgeo_bench.core.folders import file_record
+from sasgeo_bench.core.geotiff import open_geotiff
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.imagery import BANDS, ImageryEntry, PictureRecord
 from sasgeo_bench.regions.layers import RGB, Bands, find_bands, selected
-from sasgeo_bench.texts import one_line
 
 MOST_PIXELS: Final = 4_000_000_000  # of a picture
 MOST_ORTHO_PIXELS: Final = 2_000_000_000  # of what is cut out of all; what holds no picture counts too

@@ -17,8 +17,8 @@ from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import PlainFigure
-from sasgeo_bench.errors import check_given
+from sasgeo_bench.core.canvas import PlainFigure
+from sasgeo_bench.core.errors import check_given
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
 from sasgeo_bench.regions.region import Manifest, Region

@@ -11,13 +11,13 @@ import shapely
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sasgeo_bench.config import JsonDocument, Line, Record
-from sasgeo_bench.files.folders import FileRecord
+from sasgeo_bench.core.config import JsonDocument, Line, Record
+from sasgeo_bench.core.folders import FileRecord
+from sasgeo_bench.core.texts import FOLDER, html_facts
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.imagery import Imagery, OrthoRecord
-from sasgeo_bench.texts import FOLDER, html_facts
 
 if TYPE_CHECKING:
     import geopandas as gpd

@@ -13,11 +13,11 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from sasgeo_bench.config import check_document
-from sasgeo_bench.errors import ConfigError, GridError, StoreError
-from sasgeo_bench.files.folders import FileRecord, file_record, fresh_file, sha256_of
-from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.parquet import (
+from sasgeo_bench.core.config import check_document
+from sasgeo_bench.core.errors import ConfigError, GridError, StoreError
+from sasgeo_bench.core.folders import FileRecord, file_record, fresh_file, sha256_of
+from sasgeo_bench.core.json import read_json
+from sasgeo_bench.core.parquet import (
     CHECKED,
     MOST_VALUES,
     as_frame,
@@ -27,12 +27,12 @@ from sasgeo_bench.files.parquet import (
     read_table,
     write_frame,
 )
-from sasgeo_bench.files.paths import given_path
+from sasgeo_bench.core.paths import given_path
+from sasgeo_bench.core.texts import json_text
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import check_features
 from sasgeo_bench.regions.imagery import ORTHO, Imagery
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, Manifest, MapGraph, Region
-from sasgeo_bench.texts import json_text
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -86,7 +86,7 @@ def read_manifest(folder: Path) -> Manifest:
     >>> read_manifest(Path("nowhere"))
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.StoreError: nowhere holds no region.json: build the region first
+    sasgeo_bench.core.errors.StoreError: nowhere holds no region.json: build the region first
     """
     from pyproj import CRS  # noqa: PLC0415 - with GDAL and pandas the slowest import: only reading needs it
     from pyproj.exceptions import CRSError  # noqa: PLC0415

@@ -11,8 +11,8 @@ import pyproj
 import shapely
 from pydantic import ConfigDict, Field, StringConstraints, field_validator, model_validator
 
-from sasgeo_bench.config import Line, NamedDocument, find_document, list_documents, read_document
-from sasgeo_bench.errors import ConfigError, GridError
+from sasgeo_bench.core.config import Line, NamedDocument, find_document, list_documents, read_document
+from sasgeo_bench.core.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.osm.locate import Extract
@@ -41,7 +41,7 @@ class StatedProvenance(Provenance):
 class RegionFile(NamedDocument):
     """Definition of one region: identity, place, cell size and dated extracts.
 
-    >>> from sasgeo_bench.config import parse_toml
+    >>> from sasgeo_bench.core.config import parse_toml
     >>> text = '''
     ... id = "mine"
     ... title = "My place"
@@ -280,6 +280,6 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     >>> find_region_file("vadus")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
+    sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
     """
     return find_document(id_or_path, "region", "list regions shows all", lambda: list_region_files(folders=folders))

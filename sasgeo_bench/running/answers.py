@@ -11,8 +11,9 @@ from functools import partial
 from itertools import groupby
 from typing import Final, Generic, TypeVar
 
-from sasgeo_bench.errors import MatchError, StoreError
-from sasgeo_bench.files.plugins import ORACLE
+from sasgeo_bench.core.errors import MatchError, StoreError
+from sasgeo_bench.core.plugins import ORACLE
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.matching.matcher import Prediction, Status, lacks
 from sasgeo_bench.matching.tracker import check_prediction
 from sasgeo_bench.regions.region_files import check_files, read_manifest
@@ -24,7 +25,6 @@ from sasgeo_bench.running.sandbox import PROMISES, joined
 from sasgeo_bench.running.worker import Reply, Worker, guarded
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_files import asked_under
-from sasgeo_bench.texts import one_line
 
 GIVEN_UP: Final = "given up after"  # begins the message of those that are not asked any more
 

@@ -8,9 +8,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
-from sasgeo_bench.errors import SasgeoError
-from sasgeo_bench.progress import tell
-from sasgeo_bench.texts import message_of, one_line
+from sasgeo_bench.core.errors import SasgeoError
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import message_of, one_line
 
 LOG: Final = "failures.log"  # in the folder of a run; next to that of a board
 _DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
@@ -50,7 +50,7 @@ def log_beside(board: Path) -> Path:
 class Failures:
     """Failed entries by name, with the cause of each as one line, which is told; tracebacks are appended to `log`.
 
-    >>> from sasgeo_bench.progress import reporting
+    >>> from sasgeo_bench.core.progress import reporting
     >>> failures = Failures(Path("failures.log"))
     >>> with reporting(print), failures.of("graph"):
     ...     raise SasgeoError("it has no card")

@@ -17,7 +17,7 @@ from typing import Final, Self
 
 import psutil
 
-from sasgeo_bench.texts import message_of
+from sasgeo_bench.core.texts import message_of
 
 _PREFIX: Final = "sasgeo-bench-"
 _NEEDED: Final = ("memory", "pids")

@@ -7,8 +7,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from sasgeo_bench.errors import StoreError
-from sasgeo_bench.files.plugins import ORACLE
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.plugins import ORACLE
 from sasgeo_bench.matching.matcher import MatcherCard, Prediction
 from sasgeo_bench.running.worker import Reply
 from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth

@@ -10,13 +10,13 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.errors import MatchError, PerturbError
-from sasgeo_bench.files.folders import scratch_folder
+from sasgeo_bench.core.errors import MatchError, PerturbError
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.texts import message_of, one_line
 from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
 from sasgeo_bench.running.testing import Check, tiny_place, tried
 from sasgeo_bench.tasks.perturbations.all_perturbations import Ladder, find_perturbation, ladder_of
 from sasgeo_bench.tasks.perturbations.base import Perturbation
-from sasgeo_bench.texts import message_of, one_line
 
 NO_STRENGTHS: Final = (-99.0, math.nan, math.inf, "much", None, True)
 _SHAPES: Final = ((1, 1), (1, 40), (40, 3))  # rows and columns of odd views

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.files.plugins import (
+from sasgeo_bench.core.errors import ConfigError, StoreError, counted
+from sasgeo_bench.core.plugins import (
     MATCHERS,
     ORACLE,
     SEGMENTERS,
@@ -19,10 +19,11 @@ from sasgeo_bench.files.plugins import (
     list_entry_points,
     plugin_code,
 )
+from sasgeo_bench.core.progress import check_jobs
+from sasgeo_bench.core.texts import MOST_CANDIDATES
 from sasgeo_bench.matching.cards import TrainingRecord, learned_path, read_learned
 from sasgeo_bench.matching.follower import follower_record
 from sasgeo_bench.matching.matcher import SOUND, STATUSES, MatcherCard, matcher_hash
-from sasgeo_bench.progress import check_jobs
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
@@ -33,7 +34,6 @@ from sasgeo_bench.running.worker import Limits, Reach, Reply, Worker, loaded_car
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import Task, TaskManifest, asked_under, tie_key
-from sasgeo_bench.texts import MOST_CANDIDATES
 
 # Modules of this package that answers depend on, if a plugin imports them: after a change there, it is asked anew.
 TOOLS: Final = (

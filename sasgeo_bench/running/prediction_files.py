@@ -16,19 +16,13 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 from pydantic import ValidationError, ValidationInfo, ValidatorFunctionWrapHandler, field_validator
 
-from sasgeo_bench import config
-from sasgeo_bench.errors import StoreError
-from sasgeo_bench.files.folders import fresh_file, uncollected
-from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.parquet import read_batches, read_schema, read_table, write_table
-from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.cards import Names, Record, TrainingRecord
-from sasgeo_bench.matching.matcher import STATUSES, Prediction
-from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE, are_covariances
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.tasks.task_files import ASKED, POSE_FIELDS, asked_under, is_like, poses_of, tie_key
-from sasgeo_bench.texts import (
+from sasgeo_bench.core import config
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.folders import fresh_file, uncollected
+from sasgeo_bench.core.json import read_json
+from sasgeo_bench.core.parquet import read_batches, read_schema, read_table, write_table
+from sasgeo_bench.core.paths import given_path
+from sasgeo_bench.core.texts import (
     BOUNDS,
     MOST_CANDIDATES,
     MOST_DIAGNOSTICS,
@@ -39,6 +33,12 @@ from sasgeo_bench.texts import (
     json_text,
     one_line,
 )
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.cards import Names, Record, TrainingRecord
+from sasgeo_bench.matching.matcher import STATUSES, Prediction
+from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE, are_covariances
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.tasks.task_files import ASKED, POSE_FIELDS, asked_under, is_like, poses_of, tie_key
 
 RUN: Final = "run.json"
 PACKED: Final = "packed.json"  # beside it where answers came packed: they were not asked here, whatever `run.json` says

@@ -15,11 +15,11 @@ from typing import Final
 import numpy as np
 import psutil
 
-from sasgeo_bench import progress
-from sasgeo_bench.errors import ConfigError, MatchError, counted
-from sasgeo_bench.files.plugins import ORACLE
+from sasgeo_bench.core import progress
+from sasgeo_bench.core.errors import ConfigError, MatchError, counted
+from sasgeo_bench.core.plugins import ORACLE
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.matching.matcher import lacks
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run, reach_of
 from sasgeo_bench.running.runner import map_bytes

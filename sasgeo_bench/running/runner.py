@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from uuid import uuid4
 
-from sasgeo_bench import progress
-from sasgeo_bench.errors import counted
-from sasgeo_bench.files.folders import locked
+from sasgeo_bench.core import progress
+from sasgeo_bench.core.errors import counted
+from sasgeo_bench.core.folders import locked
+from sasgeo_bench.core.progress import connected, done_on, tell
 from sasgeo_bench.matching.follower import card_on_flights
-from sasgeo_bench.progress import connected, done_on, tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE

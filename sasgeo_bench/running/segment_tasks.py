@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.errors import ConfigError, StoreError, counted, named
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.errors import ConfigError, StoreError, counted, named
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.progress import reporting, spread, tell
 from sasgeo_bench.matching.cards import write_learned
 from sasgeo_bench.matching.segmenter import check_text
-from sasgeo_bench.progress import reporting, spread, tell
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter

@@ -9,8 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import SEGMENTERS
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.plugins import SEGMENTERS
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.running.segmenting import SegmenterProcess, SegmenterReply
 from sasgeo_bench.running.testing import Check, Kit

@@ -13,9 +13,9 @@ from typing import ClassVar, Final, Self
 import numpy as np
 from pydantic import TypeAdapter
 
-from sasgeo_bench.errors import ImageError, MatchError
-from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import ORACLE_SEGMENTER, SEGMENTERS
+from sasgeo_bench.core.errors import ImageError, MatchError
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.plugins import ORACLE_SEGMENTER, SEGMENTERS
 from sasgeo_bench.matching.segmenter import MOST_TEXT_BYTES, SegmenterCard, check_segmentation
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.running import wire

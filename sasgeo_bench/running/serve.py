@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
 import numpy as np
 import psutil
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.core.errors import MatchError
+from sasgeo_bench.core.texts import message_of, one_line
 from sasgeo_bench.matching.follower import Follower
 from sasgeo_bench.matching.matcher import (
     MOST_LEARNED_BYTES,
@@ -33,7 +34,6 @@ from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running import wire
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_files import pairs_from, query_from
-from sasgeo_bench.texts import message_of, one_line
 
 if TYPE_CHECKING:
     from sasgeo_bench.geometry.grid import Grid

@@ -5,7 +5,7 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.matching.plugins import load_segmenter
 from sasgeo_bench.matching.segmenter import (
     MOST_TEXT_BYTES,

@@ -10,9 +10,10 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.errors import ConfigError, SasgeoError
-from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.progress import reporting, silent
+from sasgeo_bench.core.errors import ConfigError, SasgeoError
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.progress import reporting, silent
+from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.running.testing import Check, check_of, tried
 from sasgeo_bench.tasks.build import check_task, make_tasks, plan_draw
 from sasgeo_bench.tasks.query import Query, Truth
@@ -20,7 +21,6 @@ from sasgeo_bench.tasks.sampling import Drawer
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import Draft, Shot, Site, Suite, Variant
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests
-from sasgeo_bench.texts import message_of
 
 TOWN: Final = "town-agricultural"  # a square kilometre, built in a second
 _SENTENCES: Final = ("title", "what", "separates", "falsifier")  # of a card: what a reader must be told

@@ -11,13 +11,14 @@ from typing import Any, ClassVar, Final, Generic, Literal, TypeVar
 
 import numpy as np
 
-from sasgeo_bench.errors import MatchError, counted
-from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import MATCHERS, check_card_name
+from sasgeo_bench.core.errors import MatchError, counted
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.plugins import MATCHERS, check_card_name
+from sasgeo_bench.core.progress import reporting, silent
+from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.matching.matcher import MatcherCard, Prediction, candidates_at, lacks
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.matching.tracker import check_prediction
-from sasgeo_bench.progress import reporting, silent
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Region
@@ -29,7 +30,6 @@ from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice
 from sasgeo_bench.tasks.task_files import query_bytes
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
-from sasgeo_bench.texts import message_of
 
 Outcome = Literal["pass", "fail", "not applicable"]
 AnyCard = TypeVar("AnyCard", MatcherCard, SegmenterCard)

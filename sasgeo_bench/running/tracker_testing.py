@@ -10,9 +10,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from sasgeo_bench.errors import counted
-from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import MATCHERS, TRACKERS
+from sasgeo_bench.core.errors import counted
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.plugins import MATCHERS, TRACKERS
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.matcher import MatcherCard, is_followed, lacks
 from sasgeo_bench.running.testing import Check, MapKit, TinyMap, check_of, draw, unseen

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.files.folders import locked, scratch_folder
+from sasgeo_bench.core.folders import locked, scratch_folder
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.cards import read_learned, write_learned
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.running.plan import RunPlan, reach_of, with_training_result
@@ -20,7 +21,6 @@ from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
 from sasgeo_bench.running.worker import AnyCard, Found, PluginReply, Reply, Worker, guarded
 from sasgeo_bench.sensing.segmentation import Segmentation, tables_of
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.texts import one_line
 
 
 def trained(plan: RunPlan) -> RunPlan:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
-from sasgeo_bench.errors import ConfigError, StoreError, counted, named
+from sasgeo_bench.core.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.tasks.query import PUBLISHED, Detector, Truth, base_of
 from sasgeo_bench.tasks.split import Block, Split, nearest_blocks
 from sasgeo_bench.tasks.task_files import Task, read_truths, truth_sha256

@@ -23,10 +23,18 @@ import psutil
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, TypeAdapter, ValidationError
 
 import sasgeo_bench.running.child
-from sasgeo_bench.config import shipped_dir
-from sasgeo_bench.errors import MatchError, StoreError
-from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import check_card_name, import_paths
+from sasgeo_bench.core.config import shipped_dir
+from sasgeo_bench.core.errors import MatchError, StoreError
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.plugins import check_card_name, import_paths
+from sasgeo_bench.core.texts import (
+    MOST_CANDIDATES,
+    MOST_MESSAGE,
+    MOST_S,
+    is_line,
+    message_of,
+    one_line,
+)
 from sasgeo_bench.matching.matcher import (
     MOST_LEARNED_BYTES,
     MOST_SAID,
@@ -45,14 +53,6 @@ from sasgeo_bench.running.wire import Message
 from sasgeo_bench.sensing.image import LABELLED
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_files import pairs_bytes
-from sasgeo_bench.texts import (
-    MOST_CANDIDATES,
-    MOST_MESSAGE,
-    MOST_S,
-    is_line,
-    message_of,
-    one_line,
-)
 
 _MOST_BYTES: Final = 2**50  # of memory
 

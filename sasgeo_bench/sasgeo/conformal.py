@@ -18,7 +18,7 @@ import scipy  # its statistics are loaded where they are used: matchers start wi
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from sasgeo_bench.errors import ConfigError, ShapeError
+from sasgeo_bench.core.errors import ConfigError, ShapeError
 from sasgeo_bench.sasgeo.integrity import Diagnostic, Modes
 
 # Fixed before any answer is seen: that is what the promise hangs on. Tests begin at each of `_STARTS`, which share

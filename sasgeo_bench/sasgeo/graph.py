@@ -14,7 +14,7 @@ from typing import Any, Final, Self
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, inverse, wrap_deg
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS, Bools, Floats, Ints

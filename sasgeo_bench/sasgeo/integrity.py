@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.search.plan import Null, posterior
 
 APART_M: Final = 25.0  # the widest tolerance of the benchmark: nearer modes are one answer

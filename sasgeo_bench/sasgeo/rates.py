@@ -11,7 +11,7 @@ import scipy  # its optimizers are loaded where they are used: matchers that do 
 from numpy.typing import NDArray
 from scipy import special
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.regions.region import Region

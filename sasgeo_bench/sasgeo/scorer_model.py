@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.sasgeo.graph import GraphRules
 from sasgeo_bench.sasgeo.joint import Blend
 from sasgeo_bench.sasgeo.raster import likeness_by_hand

@@ -15,7 +15,7 @@ from typing import ClassVar, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import PoseError
+from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.matching.belief_fix import fix_of, followed
 from sasgeo_bench.matching.controls.blind import is_blind

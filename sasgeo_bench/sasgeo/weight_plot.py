@@ -14,7 +14,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import Page, page, without_ticks
+from sasgeo_bench.core.canvas import Page, page, without_ticks
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.preview import GROUND, class_keys, north_arrow, scale_bar
 from sasgeo_bench.regions.region import Manifest

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

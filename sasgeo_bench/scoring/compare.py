@@ -13,7 +13,7 @@ from scipy.stats import chi2, norm, permutation_test
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
 
-from sasgeo_bench.errors import MetricError, counted
+from sasgeo_bench.core.errors import MetricError, counted
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, block_codes, check_column
 from sasgeo_bench.scoring.decisions import Curve, Fixes
 from sasgeo_bench.scoring.frames import Column, Schema, Shown, row_columns

@@ -11,8 +11,8 @@ import pandas as pd
 from pydantic import ConfigDict, Field
 from scipy.sparse import hstack
 
-from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.progress import tell
+from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.scoring.base import Bools, Floats, block_codes, codes_of
 from sasgeo_bench.scoring.compare import (
     ALPHA,

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import counted
+from sasgeo_bench.core.errors import counted
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, LEAST_PLACES, Finding
 from sasgeo_bench.scoring.contrasts import PRIMARY, Contrast, both_on, mean_finding

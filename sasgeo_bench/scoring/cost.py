@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 

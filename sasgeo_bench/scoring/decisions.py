@@ -15,7 +15,7 @@ from scipy import special
 from scipy.sparse import csr_array
 from scipy.special import digamma
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column, check_weights, weighted_mean
 
 COST_RATIOS: Final = (5.0, 20.0, 100.0)

@@ -12,12 +12,13 @@ from typing import Final, Self
 
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted, named
-from sasgeo_bench.files.plugins import ORACLE, shipped_names
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError, counted, named
+from sasgeo_bench.core.plugins import ORACLE, shipped_names
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.matching.cards import Learned, TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.submission import Submission
-from sasgeo_bench.progress import tell
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import RUN, Answers, CardRecord, RunManifest, StoredAnswers, damaged
 from sasgeo_bench.scoring.controls import Verdict, hold_controls, knows_too_much
@@ -28,7 +29,6 @@ from sasgeo_bench.scoring.submission_files import predictions_name, read_submiss
 from sasgeo_bench.tasks.query import CONTROLS, base_of
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import QUERIES, TASK, Task, read_batches
-from sasgeo_bench.texts import one_line
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
@@ -222,7 +222,8 @@ def check_name(name: str, taken: Collection[str] = (), *, source: str) -> None:
     >>> check_name("random", source="card.toml")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: card.toml: 'random' is the name of a control of every board: choose another name
+    sasgeo_bench.core.errors.ConfigError: card.toml: 'random' is the name of a control of every board: choose another
+    name
     """
     kinds = {
         "a control of every board": is_unranked(name),

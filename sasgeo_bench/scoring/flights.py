@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.geometry.pose import reckon, wrap_deg
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.tracker import SIDE

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final, NamedTuple, Self, TypeVar, get_args, g
 
 import pandas as pd
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.scoring.intervals import BoardInterval, Interval
 
 Item = TypeVar("Item")
@@ -135,7 +135,7 @@ class Schema:
         >>> Schema("controls", (Column("matcher", str, "Its name"),)).check(pd.DataFrame({"control": ["blind"]}))
         Traceback (most recent call last):
             ...
-        sasgeo_bench.errors.StoreError: controls.parquet has no column 'matcher': score it again
+        sasgeo_bench.core.errors.StoreError: controls.parquet has no column 'matcher': score it again
         """
         if not (self.is_required or len(table.columns)):
             return

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from statsmodels.stats.proportion import proportion_confint
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.scoring.base import Floats, Ints, block_codes, check_column, check_weights, weighted_mean
 
 DRAWS: Final = 10_000

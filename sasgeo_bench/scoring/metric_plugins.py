@@ -11,16 +11,16 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import MatchError, MetricError
-from sasgeo_bench.files.plugins import METRICS as GROUP
-from sasgeo_bench.files.plugins import check_own_name, code_of, find_inside, list_entry_points, plugin_code
-from sasgeo_bench.progress import tell
+from sasgeo_bench.core.errors import MatchError, MetricError
+from sasgeo_bench.core.plugins import METRICS as GROUP
+from sasgeo_bench.core.plugins import check_own_name, code_of, find_inside, list_entry_points, plugin_code
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.metric import MeanMetric, Metric
 from sasgeo_bench.scoring.metrics import METRICS, TRACKS
 from sasgeo_bench.scoring.rows import LEADERBOARD_SCHEMA
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
-from sasgeo_bench.texts import message_of
 
 SHIPPED: Final[Mapping[str, Metric]] = {metric.name: metric for metric in METRICS}
 COLUMNS: Final = frozenset({*LEADERBOARD_SCHEMA.names, "rank", "control"})  # of boards and their tables
@@ -56,8 +56,8 @@ def find_metric(spec: str) -> Metric:
     >>> find_metric("succes_25m")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.MatchError: there is no metric 'succes_25m', did you mean 'success_25m'? (list metrics shows
-    all; or module:NAME)
+    sasgeo_bench.core.errors.MatchError: there is no metric 'succes_25m', did you mean 'success_25m'? (list metrics
+    shows all; or module:NAME)
     """
     return SHIPPED[spec] if spec in SHIPPED else _foreign(spec)
 

@@ -13,9 +13,9 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, MatchError, MetricError
-from sasgeo_bench.files.folders import scratch_folder
-from sasgeo_bench.files.plugins import METRICS
+from sasgeo_bench.core.errors import ConfigError, MatchError, MetricError
+from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.core.plugins import METRICS
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.scaffold import Package, files_of
 from sasgeo_bench.running.testing import Check, tiny_place, tried

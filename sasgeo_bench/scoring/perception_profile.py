@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.errors import MetricError, named
+from sasgeo_bench.core.errors import MetricError, named
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.segmentation import PixelCounts, precision, recall_said, told_classes
 from sasgeo_bench.tasks.perturbations.perception_profile import ClassConfusions, PerceptionProfile

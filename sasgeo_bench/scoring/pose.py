@@ -9,7 +9,7 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.matching.matcher import Prediction, candidates_at
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from statsmodels.stats.proportion import proportion_confint
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.sasgeo.conformal import METHODS, RISKS, SCALE, level_name
 from sasgeo_bench.scoring.base import Bools, Floats, check_column, codes_of, weighted_mean

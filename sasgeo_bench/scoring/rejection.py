@@ -13,10 +13,11 @@ from typing import Annotated, Final, Self
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, MatchError, counted
+from sasgeo_bench.core.errors import ConfigError, MatchError, counted
+from sasgeo_bench.core.progress import spread, tell
+from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.matching.matcher import Prediction, Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.matching.plugins import rejector_maker
-from sasgeo_bench.progress import spread, tell
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.controls import EVERY
@@ -45,7 +46,6 @@ from sasgeo_bench.scoring.rejection_rows import (
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, some_rows
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.texts import message_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

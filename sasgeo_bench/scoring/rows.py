@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, NamedTuple, Self, TypeVar
 
 import pandas as pd
 
-from sasgeo_bench.files.plugins import YARDSTICK
+from sasgeo_bench.core.plugins import YARDSTICK
 from sasgeo_bench.scoring.frames import (
     MATCHER,
     PRIOR_GROUP,

@@ -8,7 +8,7 @@ from typing import Annotated, Final, Self
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.matching.matcher import SAME_PLACE_M, Prediction
 from sasgeo_bench.running.prediction_files import AnswerColumns, Answers
 from sasgeo_bench.scoring.base import Bools, Floats, Ints

@@ -14,8 +14,8 @@ from typing import Final, Literal, Self
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.errors import MetricError, StoreError
-from sasgeo_bench.files.parquet import read_frame, write_frame
+from sasgeo_bench.core.errors import MetricError, StoreError
+from sasgeo_bench.core.parquet import read_frame, write_frame
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.scoring.base import Floats, Ints
 from sasgeo_bench.scoring.intervals import ClusterDraws, percentile_interval, seed_of_text

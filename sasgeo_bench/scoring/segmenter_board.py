@@ -10,8 +10,8 @@ from typing import Any, Final, Self
 
 import pandas as pd
 
-from sasgeo_bench.errors import MetricError, StoreError
-from sasgeo_bench.files.parquet import read_frame, write_frame
+from sasgeo_bench.core.errors import MetricError, StoreError
+from sasgeo_bench.core.parquet import read_frame, write_frame
 from sasgeo_bench.scoring.compare import LEAST_PLACES
 from sasgeo_bench.scoring.perception_profile import measure_profile
 from sasgeo_bench.scoring.segmentation import (

@@ -14,11 +14,12 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from sasgeo_bench.config import check_document
-from sasgeo_bench.errors import MatchError, SasgeoError, StoreError, counted
-from sasgeo_bench.files.folders import check_known, file_record, fresh_folder, is_ours, locked
-from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.parquet import open_table, write_table
+from sasgeo_bench.core.config import check_document
+from sasgeo_bench.core.errors import MatchError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.folders import check_known, file_record, fresh_folder, is_ours, locked
+from sasgeo_bench.core.json import read_json
+from sasgeo_bench.core.parquet import open_table, write_table
+from sasgeo_bench.core.texts import MOST_CANDIDATES, json_text
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, AnsweredTask, Submission, SubmittedFile
@@ -41,7 +42,6 @@ from sasgeo_bench.running.prediction_files import (
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import ASKED, Task
-from sasgeo_bench.texts import MOST_CANDIDATES, json_text
 
 SUBMISSION: Final = "submission.json"
 PREDICTIONS: Final = "predictions"

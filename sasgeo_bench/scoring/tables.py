@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from sasgeo_bench import progress
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core import progress
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.regions.region_spec import Scene
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, codes_of, weighted_quantile
 from sasgeo_bench.scoring.compare import LEAST_PLACES, RankInterval, distinguishable, rank_intervals, sensitivity

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sasgeo_bench.errors import PoseError
+from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, normalize_deg
 from sasgeo_bench.search.field import FULL, Field, Level, Levels, Template, between, pooled, warped

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import SasgeoError, ShapeError, StoreError
-from sasgeo_bench.files.folders import check_known, fresh_folder, is_ours, locked
-from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.errors import SasgeoError, ShapeError, StoreError
+from sasgeo_bench.core.folders import check_known, fresh_folder, is_ours, locked
+from sasgeo_bench.core.json import read_json
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.search.field import Field, Level, is_thin, round_kernel
-from sasgeo_bench.texts import message_of
 
 FACTORS: Final = (1, 2, 4, 8, 16, 32)  # cells of 2 m: views of up to 2 km
 WINDOW_CELLS: Final = 2048  # of the map's own cells: 14 bands of one window take 60 MB

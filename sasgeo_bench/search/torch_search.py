@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from sasgeo_bench.errors import ConfigError, ShapeError
+from sasgeo_bench.core.errors import ConfigError, ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, inverse
 from sasgeo_bench.search.dense import LEAST_SCALE, NEXT, SPARE

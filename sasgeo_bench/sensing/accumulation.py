@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
-from sasgeo_bench.errors import CameraError, ShapeError
+from sasgeo_bench.core.errors import CameraError, ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import cell_offsets_m

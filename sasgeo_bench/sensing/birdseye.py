@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import CameraError, ShapeError
+from sasgeo_bench.core.errors import CameraError, ShapeError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence, cell_offsets_m

@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sasgeo_bench.errors import CameraError
+from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.sensing.ground import Ground, Plane
 

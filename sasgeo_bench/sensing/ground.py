@@ -16,10 +16,10 @@ from rasterio.errors import RasterioError
 from rasterio.vrt import WarpedVRT
 from scipy.ndimage import map_coordinates
 
-from sasgeo_bench.errors import CameraError
-from sasgeo_bench.files.geotiff import open_geotiff
+from sasgeo_bench.core.errors import CameraError
+from sasgeo_bench.core.geotiff import open_geotiff
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.texts import one_line
 
 Points = NDArray[np.float64]
 

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from sasgeo_bench.errors import ImageError, StoreError
-from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.errors import ImageError, StoreError
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, UNKNOWN, pack, unpack
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
-from sasgeo_bench.texts import message_of
 
 Picture = NDArray[np.uint8]
 
@@ -70,7 +70,8 @@ def decode_image(
     >>> decode_image(encoded.getvalue(), name="roof.png", most_pixels=5)
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ImageError: roof.png has 3 x 2 pixels, at most 5 are decoded: cut it, or scale it down, first
+    sasgeo_bench.core.errors.ImageError: roof.png has 3 x 2 pixels, at most 5 are decoded: cut it, or scale it down,
+    first
     """
     if not data:
         raise ImageError(f"{name} is empty: copy or download it again")
@@ -235,7 +236,7 @@ def check_classes(classes: tuple[str, ...]) -> None:
     >>> check_classes(("building", "water", "building"))
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ImageError: classes are at least one and each once, got building, water, building
+    sasgeo_bench.core.errors.ImageError: classes are at least one and each once, got building, water, building
     """
     if not classes or len(set(classes)) != len(classes):
         raise ImageError(f"classes are at least one and each once, got {', '.join(classes) or 'none'}")

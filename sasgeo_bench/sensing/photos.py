@@ -15,13 +15,13 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 from scipy.spatial.transform import Rotation
 
-from sasgeo_bench.errors import CameraError, ImageError
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.errors import CameraError, ImageError
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.texts import message_of, one_line
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.geometry.projection import from_lonlat
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
-from sasgeo_bench.texts import message_of, one_line
 
 _TIFF_MARKS: Final = (b"II*\0", b"MM\0*")
 _WIDTH, _HEIGHT, _KIND, _PARTS, _XMP, _CROP = 256, 257, 254, 330, 700, 50720

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import shapely
 
-from sasgeo_bench.errors import ConfigError, ImageryError, SasgeoError, StoreError
-from sasgeo_bench.files.folders import file_record, fresh_folder, locked
+from sasgeo_bench.core.errors import ConfigError, ImageryError, SasgeoError, StoreError
+from sasgeo_bench.core.folders import file_record, fresh_folder, locked
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.projection import from_lonlat
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, package_version, plan_build, share_shown
 from sasgeo_bench.regions.evidence import UNKNOWN
@@ -150,7 +150,7 @@ class Look:
     >>> Look(season="monsoon")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: season is one of spring, summer, autumn, winter, snow, got 'monsoon'
+    sasgeo_bench.core.errors.ConfigError: season is one of spring, summer, autumn, winter, snow, got 'monsoon'
     """
 
     family: Family = "calibration"

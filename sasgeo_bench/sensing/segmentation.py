@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
-from sasgeo_bench.errors import ImageError
+from sasgeo_bench.core.errors import ImageError
 from sasgeo_bench.sensing.image import check_classes, pack_parts, split_parts, unpack_body
 
 SILENT: Final = 255  # the byte of a pixel of which nothing is said

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from sasgeo_bench.errors import CameraError
+from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.sensing.camera import Attitude, Camera
 from sasgeo_bench.sensing.ground import Plane

@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
-from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
-from sasgeo_bench.files.folders import fresh_folder, locked
-from sasgeo_bench.progress import reporting, spread, tell
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.folders import fresh_folder, locked
+from sasgeo_bench.core.progress import reporting, spread, tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import read_bits

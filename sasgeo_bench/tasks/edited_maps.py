@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import geopandas as gpd
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.build import build_edited, plan_build
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.graph import build_graph

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ConfigError, FlightError
+from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights.drift_profile import load_profile
 from sasgeo_bench.flights.kinematics import fly
 from sasgeo_bench.flights.odometry import Odometry, draw_odometry

@@ -13,8 +13,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ImageError
-from sasgeo_bench.files.parquet import open_table
+from sasgeo_bench.core.errors import ImageError
+from sasgeo_bench.core.parquet import open_table
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, UNKNOWN, pack, unpack
 
 # Every process of a matcher reads queries, and few look at pictures: what these need is imported where it is used.

@@ -16,13 +16,13 @@ from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from sasgeo_bench.config import Record
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import fresh_file, locked
-from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.progress import tell
-from sasgeo_bench.texts import json_text
+from sasgeo_bench.core.config import Record
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.folders import fresh_file, locked
+from sasgeo_bench.core.json import read_json
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import json_text
 
 LEAST_BITS: Final = 64  # fewer can be guessed: a query's id verifies a guess, some 10^6 a second
 REPRODUCING_BITS: Final = 128  # least for a seed that certifies a row

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Final, Literal, Self
 import numpy as np
 import shapely
 
-from sasgeo_bench.errors import ConfigError, PoseError, ShapeError
+from sasgeo_bench.core.errors import ConfigError, PoseError, ShapeError
+from sasgeo_bench.core.texts import html_facts
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
-from sasgeo_bench.texts import html_facts
 
 if TYPE_CHECKING:
     import geopandas as gpd

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth

@@ -13,9 +13,9 @@ import pyarrow as pa
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import StoreError
-from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.parquet import read_table, write_table
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.parquet import read_table, write_table
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.preview import PAINT_ORDER
 from sasgeo_bench.sensing.segmentation import CERTAIN, SILENT, Segmentation

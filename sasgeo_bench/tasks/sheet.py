@@ -21,8 +21,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import Page, PlainFigure, page, panels, without_ticks
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.core.canvas import Page, PlainFigure, page, panels, without_ticks
+from sasgeo_bench.core.errors import ConfigError, StoreError, counted
 from sasgeo_bench.geometry.pose import Pose, reckon
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files

@@ -14,8 +14,8 @@ import pyproj
 import shapely
 from pydantic import Field, model_validator
 
-from sasgeo_bench.config import Document, Line, NamedDocument, find_document, list_documents, read_document
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import Document, Line, NamedDocument, find_document, list_documents, read_document
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.projection import between, to_lonlat
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file

@@ -9,7 +9,7 @@ import shapely
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import Page, page, panels, without_ticks
+from sasgeo_bench.core.canvas import Page, page, panels, without_ticks
 from sasgeo_bench.geometry.projection import between
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.tasks.split import HALVES, Block, Split

@@ -18,19 +18,19 @@ import pyarrow as pa
 import shapely
 from pydantic import ConfigDict, Field, JsonValue
 
-from sasgeo_bench.config import Document, check_document
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
-from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.parquet import open_table, read_schema, read_table, table_writer
-from sasgeo_bench.files.paths import given_path
+from sasgeo_bench.core.config import Document, check_document
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.folders import FileRecord, file_record, sha256_of
+from sasgeo_bench.core.json import read_json
+from sasgeo_bench.core.parquet import open_table, read_schema, read_table, table_writer
+from sasgeo_bench.core.paths import given_path
+from sasgeo_bench.core.texts import FOLDER, json_text
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, Evidence, pack, unpack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest, Provenance
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.tasks.frames import FRAME, LABEL_SCHEMA, LABELS, frame_of, frame_row, label_row
 from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, TASK_VERSIONS, Head, Query, Step, Truth
-from sasgeo_bench.texts import FOLDER, json_text
 
 if TYPE_CHECKING:
     import geopandas as gpd

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.errors import ConfigError, ExtractError, ImageryError
+from sasgeo_bench.core.errors import ConfigError, ExtractError, ImageryError
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.osm.locate import Extract
-from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
 from sasgeo_bench.tasks import task_files

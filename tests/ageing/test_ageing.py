@@ -28,7 +28,7 @@ from sasgeo_bench.ageing.measure import (
     polygons_of,
     seeded_rng,
 )
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.osm.history import History, Lifecycle, ObjectKey, Span, State
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from tests.drawn_features import features_of

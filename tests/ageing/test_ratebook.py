@@ -17,8 +17,8 @@ from sasgeo_bench.ageing.ratebook import (
     load_ratebook,
     pool_rates,
 )
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 
 MEASURED = Path(__file__).parents[2] / "docs" / "ageing"

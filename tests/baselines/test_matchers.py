@@ -15,7 +15,7 @@ import pytest
 from sasgeo_baselines.global_descriptor import GlobalDescriptor, Sums
 from sasgeo_baselines.map_density_prior import MapDensityPrior
 
-from sasgeo_bench.files.plugins import YARDSTICK
+from sasgeo_bench.core.plugins import YARDSTICK
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import MatcherCard, check_match
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence

@@ -11,7 +11,7 @@ import shapely
 from sasgeo_baselines import oracle_objects
 from sasgeo_baselines.oracle_objects import OracleObjects, objects_at
 
-from sasgeo_bench.files.plugins import YARDSTICK
+from sasgeo_bench.core.plugins import YARDSTICK
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Training
 from sasgeo_bench.regions.region_files import read_region

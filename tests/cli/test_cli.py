@@ -12,8 +12,8 @@ import pytest
 
 from sasgeo_bench.cli import segmenters
 from sasgeo_bench.cli.program import COMMANDS, help_of, load, spelled_out
-from sasgeo_bench.config import shipped_dir
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import shipped_dir
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import read_region_file
 from tests.slow import rest_slow

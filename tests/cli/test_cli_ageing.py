@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sasgeo_bench.ageing.ratebook import RateBook
-from sasgeo_bench.config import parse_toml
+from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
 
 

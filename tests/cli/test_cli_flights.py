@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sasgeo_bench.files.parquet import read_frame
+from sasgeo_bench.core.parquet import read_frame
 from sasgeo_bench.flights.drift_profile import load_profile, read_drift_profile
 from sasgeo_bench.flights.odometry import dead_reckon, draw_odometry
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum, write_tum

@@ -4,7 +4,7 @@
 import pyarrow.parquet as pq
 import pytest
 
-from tests.importers import writers
+from tests.exchange.importers import writers
 
 PLACES = {"000000": (120.38, 30.32), "000001": (120.381, 30.32), "002256": (119.5, 29.1)}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from sasgeo_bench.config import shipped_dir
+from sasgeo_bench.core.config import shipped_dir
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.region_spec import read_region_file

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED
-from sasgeo_bench.files.plugins import MATCHERS
+from sasgeo_bench.core.plugins import MATCHERS
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import RunManifest

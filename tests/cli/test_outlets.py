@@ -10,13 +10,13 @@ from threading import Event
 
 import pytest
 
-from sasgeo_bench import progress
 from sasgeo_bench.cli import console
 from sasgeo_bench.cli import program as program_file
 from sasgeo_bench.cli.console import complain, heartbeat, note, open_outlets, outlets, say, tell
-from sasgeo_bench.config import shipped_dir
-from sasgeo_bench.errors import StoreError
-from sasgeo_bench.progress import Lines
+from sasgeo_bench.core import progress
+from sasgeo_bench.core.config import shipped_dir
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.progress import Lines
 
 TIMED = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\+00:00 .+")
 

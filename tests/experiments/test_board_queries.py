@@ -11,15 +11,15 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.boards.pipeline_spec import PipelineFile
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.exchange.release import ReleaseRequest, make_release
+from sasgeo_bench.exchange.submissions import SubmitRequest, hold_submission, make_submission
 from sasgeo_bench.experiments import board_queries
 from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, draw_board
 from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
-from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.submission import Card, example_card
-from sasgeo_bench.publishing.release import ReleaseRequest, make_release
-from sasgeo_bench.publishing.submissions import SubmitRequest, hold_submission, make_submission
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.task_plan import Request
 from tests.experiments.test_pipeline import TEXT as PIPELINE
@@ -36,7 +36,7 @@ def request_(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     (folder / "small.toml").write_text(TEXT, encoding="utf-8")
     spec = parse_toml(TEXT, PipelineFile, source="small.toml")
     with threaded(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sasgeo_bench.leaderboard.build.make_extras", lambda *_: [])
+        patch.setattr("sasgeo_bench.boards.build.make_extras", lambda *_: [])
         run_pipeline(plan_pipeline(spec, out=out), results=folder / "results")
     return BoardRequest(stored=folder / "results" / "small", out=out, pipeline=folder / "small.toml")
 

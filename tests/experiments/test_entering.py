@@ -12,20 +12,20 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 
+from sasgeo_bench.boards.manifests import BoardManifest
+from sasgeo_bench.boards.pipeline_spec import PipelineFile
 from sasgeo_bench.cli import entering as cli_entering
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.core.progress import reporting
+from sasgeo_bench.exchange import submissions
+from sasgeo_bench.exchange.submissions import beside_stored, hold_submission, with_submissions
 from sasgeo_bench.experiments import board_queries, entering, entry_cost
 from sasgeo_bench.experiments.board_queries import asked_tasks, same_queries
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, plan_entry
 from sasgeo_bench.experiments.pipeline import ask, draw_all, plan_pipeline, plan_runs, run_pipeline
-from sasgeo_bench.leaderboard.manifests import BoardManifest
-from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.osm.locate import Extract
-from sasgeo_bench.progress import reporting
-from sasgeo_bench.publishing import submissions
-from sasgeo_bench.publishing.submissions import beside_stored, hold_submission, with_submissions
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.scoring.submission_files import read_submission
 from sasgeo_bench.tasks.private_seed import PrivateSeed, SealedPlace

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.boards.pipeline_spec import ArchiveSpec, PipelineFile
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.experiments import head_start
 from sasgeo_bench.experiments.head_start import unpack_head_start
-from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, PipelineFile
-from sasgeo_bench.progress import reporting
 from sasgeo_bench.running.prediction_files import RunManifest
 
 RUN = "runs/random/abc/clean/one"

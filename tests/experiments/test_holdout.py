@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.boards.pipeline_spec import PipelineFile
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.experiments import pipeline
 from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
-from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.progress import reporting
 from tests.handmade import split_file
 
 pytestmark = pytest.mark.usefixtures("in_threads", "without_drawings", "few_controls")

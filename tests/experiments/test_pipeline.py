@@ -10,18 +10,18 @@ import pandas as pd
 import pytest
 from sasgeo_baselines.rejectors.margin import Margin
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError, MatchError
-from sasgeo_bench.experiments import pipeline
-from sasgeo_bench.experiments.pipeline import is_asked, plan_pipeline, run_pipeline
-from sasgeo_bench.leaderboard.pipeline_spec import (
+from sasgeo_bench.boards.pipeline_spec import (
     PipelineFile,
     find_pipeline_file,
     list_pipeline_files,
     read_pipeline_file,
 )
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError, MatchError
+from sasgeo_bench.core.progress import reporting
+from sasgeo_bench.experiments import pipeline
+from sasgeo_bench.experiments.pipeline import is_asked, plan_pipeline, run_pipeline
 from sasgeo_bench.matching.controls.blind import PriorCentre
-from sasgeo_bench.progress import reporting
 from sasgeo_bench.tasks import build as tasks
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks

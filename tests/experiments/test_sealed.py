@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.boards.board_files import read_board_manifest
+from sasgeo_bench.boards.manifests import BoardManifest
+from sasgeo_bench.boards.pipeline_spec import LearningSpec, PipelineFile
+from sasgeo_bench.boards.text import sealed_lines
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.experiments import sealed
 from sasgeo_bench.experiments.pipeline import TrainingGroups, plan_pipeline, run_pipeline
 from sasgeo_bench.experiments.sealed import open_seal
-from sasgeo_bench.leaderboard.board_files import read_board_manifest
-from sasgeo_bench.leaderboard.manifests import BoardManifest
-from sasgeo_bench.leaderboard.pipeline_spec import LearningSpec, PipelineFile
-from sasgeo_bench.leaderboard.text import sealed_lines
-from sasgeo_bench.progress import reporting
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks
 from sasgeo_bench.tasks.private_seed import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.drift import measure_drift, pair_run
 from sasgeo_bench.flights.trajectory import Trajectory, in_axes, read_tum
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sasgeo_bench.errors import ConfigError, FlightError
+from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights.drift import (
     fit_profile,
     law_figures,

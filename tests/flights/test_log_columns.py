@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.log_points import FlightLog
 from sasgeo_bench.flights.logs import read_log
 

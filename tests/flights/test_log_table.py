@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.log_formats import FORMATS, NAMES, QUANTITIES
 from sasgeo_bench.flights.log_points import FlightLog, LogSource, steps_m
 from sasgeo_bench.flights.log_table import Clock

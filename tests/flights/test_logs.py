@@ -14,7 +14,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights import log_points
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import read_flight, read_log

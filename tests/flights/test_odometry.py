@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError, FlightError, StoreError
+from sasgeo_bench.core.errors import ConfigError, FlightError, StoreError
 from sasgeo_bench.flights.drift_profile import (
     DriftProfile,
     Dropouts,

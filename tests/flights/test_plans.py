@@ -13,7 +13,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.kinematics import Limits, length_m
 from sasgeo_bench.flights.plans import KINDS, Corridors, flight_area, plan_flight
 from sasgeo_bench.regions.region import Region

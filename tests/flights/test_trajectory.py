@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.sensing.camera import Attitude
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sasgeo_bench.errors import GridError
+from sasgeo_bench.core.errors import GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 
 cell_sizes = st.floats(0.1, 50.0)

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 import sasgeo_bench
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.geometry import pairs
 from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm import read

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import PoseError
+from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.geometry.pose import Pose, Prior, inverse, wrap_deg
 
 poses = st.builds(

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.matching.cards import read_card, read_card_file
 from sasgeo_bench.matching.submission import example_card
 

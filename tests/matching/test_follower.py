@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.follower import Follower, FollowPlan, card_on_flights, follower_record

@@ -8,9 +8,9 @@ from importlib.metadata import distribution
 
 import pytest
 
-from sasgeo_bench.errors import MatchError
-from sasgeo_bench.files import plugins
-from sasgeo_bench.files.plugins import (
+from sasgeo_bench.core import plugins
+from sasgeo_bench.core.errors import MatchError
+from sasgeo_bench.core.plugins import (
     MATCHERS,
     SHIPPED,
     check_card_name,

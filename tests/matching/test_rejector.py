@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.matching.matcher import Prediction, Rejector, RejectorCard, check_p_false
 from sasgeo_bench.matching.plugins import load_rejector
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import sasgeo_bench
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugins import MATCHERS, SEGMENTERS, SHIPPED, TRACKERS, list_entry_points
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.plugins import MATCHERS, SEGMENTERS, SHIPPED, TRACKERS, list_entry_points
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match
 from sasgeo_bench.matching.scaffold import package_files, write_plugin

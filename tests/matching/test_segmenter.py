@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ImageError, MatchError
-from sasgeo_bench.files.plugins import (
+from sasgeo_bench.core.errors import ImageError, MatchError
+from sasgeo_bench.core.plugins import (
     ORACLE_SEGMENTER,
     SEGMENTERS,
     check_card_name,

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.controls.reckoning import DeadReckoning, advance
 from sasgeo_bench.matching.plugins import load_method, load_tracker

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.core.errors import ExtractError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.history import DatedExtract, date_extracts, read_history
 from sasgeo_bench.osm.read import read_extract

@@ -10,11 +10,11 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.coverage import LONGEST_M, ground_within_reach
 from sasgeo_bench.osm.mapped import CUT
 from sasgeo_bench.osm.read import read_extract
-from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import OUTSIDE
 from sasgeo_bench.regions.region_files import read_region

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 import shapely
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.osm.features import DTYPES, check_features, fingerprint, make_features
 
 

@@ -10,7 +10,7 @@ import pytest
 import shapely
 from osmium.osm.mutable import Node, Way
 
-from sasgeo_bench.errors import CoverageError, ExtractError
+from sasgeo_bench.core.errors import CoverageError, ExtractError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.osm.snapshot import is_history, read_header

@@ -6,9 +6,9 @@ import json
 import pytest
 import shapely
 
-from sasgeo_bench.config import check_document
-from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
-from sasgeo_bench.files.folders import sha256_of
+from sasgeo_bench.core.config import check_document
+from sasgeo_bench.core.errors import ConfigError, CoverageError, ExtractError
+from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.geojson import identity_of, tags_of
 from sasgeo_bench.osm.locate import ExtractPart, find_parts

@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from sasgeo_bench.ageing.measure import measure_ageing
-from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
+from sasgeo_bench.core.errors import ConfigError, CoverageError, ExtractError
 from sasgeo_bench.osm.history import DatedExtract, ObjectKey, date_extracts, parse_start, read_history, read_lifecycle
 from sasgeo_bench.osm.synthetic.town import BULK_REDRAW, TownPlan, _things, write_town
 

@@ -10,8 +10,8 @@ from functools import partial
 import pooch
 import pytest
 
-from sasgeo_bench.errors import ExtractError
-from sasgeo_bench.files.folders import PREFIX
+from sasgeo_bench.core.errors import ExtractError
+from sasgeo_bench.core.folders import PREFIX
 from sasgeo_bench.osm import locate
 from sasgeo_bench.osm.locate import Extract, TownEntry, extract_folders, find_extract
 

@@ -15,7 +15,7 @@ import pytest
 import shapely
 from osmium.osm.mutable import Node, Way
 
-from sasgeo_bench.errors import CoverageError
+from sasgeo_bench.core.errors import CoverageError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.mapped import project
 from sasgeo_bench.osm.read import misdated, read_extract

@@ -5,8 +5,8 @@ import re
 
 import pytest
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import Rule, SemanticClass, Taxonomy, classify, load_taxonomy
 
 ONE_CLASS = """

@@ -38,7 +38,7 @@ from sasgeo_paper.trials import (
     rectangle,
 )
 
-from sasgeo_bench.errors import ConfigError, PerturbError
+from sasgeo_bench.core.errors import ConfigError, PerturbError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN

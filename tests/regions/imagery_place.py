@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from rasterio.features import rasterize
 from shapely import affinity
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.files.folders import sha256_of
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.regions.region_spec import RegionFile
 
 EPSG = 32632

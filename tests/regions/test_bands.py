@@ -11,7 +11,7 @@ from affine import Affine
 from rasterio.enums import ColorInterp as Is
 from scipy import ndimage
 
-from sasgeo_bench.errors import ImageryError
+from sasgeo_bench.core.errors import ImageryError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.imagery import ImageryEntry, read_window
 from sasgeo_bench.regions.ortho import check_picture, is_empty, ortho_grid, write_ortho

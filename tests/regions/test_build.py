@@ -17,11 +17,11 @@ import rasterio
 import shapely
 from shapely import affinity
 
-from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError, StoreError
-from sasgeo_bench.files.folders import FileRecord
+from sasgeo_bench.core.errors import ConfigError, CoverageError, ExtractError, StoreError
+from sasgeo_bench.core.folders import FileRecord
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.read import Reading
-from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions import build, region_files
 from sasgeo_bench.regions.build import build_made, build_region, plan_build
 from sasgeo_bench.regions.evidence import PRESENT, LayerBits

@@ -13,7 +13,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES, build_graph
 from sasgeo_bench.regions.region import MapGraph
 from tests.drawn_features import features_of

@@ -12,7 +12,7 @@ import shapely
 from affine import Affine
 from rio_cogeo.cogeo import cog_validate
 
-from sasgeo_bench.errors import ConfigError, ExtractError, ImageryError, StoreError
+from sasgeo_bench.core.errors import ConfigError, ExtractError, ImageryError, StoreError
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import (

@@ -15,8 +15,8 @@ from rio_cogeo.cogeo import cog_validate
 from tifffile import TiffFile
 
 import sasgeo_bench
-from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.geotiff import open_geotiff
+from sasgeo_bench.core.errors import SasgeoError, StoreError
+from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions import layers
 from sasgeo_bench.regions.imagery import read_window

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 import shapely
 
-from sasgeo_bench.errors import GridError
+from sasgeo_bench.core.errors import GridError
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.region_files import read_region, write_manifest, write_tables
 

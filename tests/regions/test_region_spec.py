@@ -5,8 +5,8 @@ import datetime as dt
 
 import pytest
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.region_spec import RegionFile
 
 EXTRACT = f'[[extract]]\nfile = "a.osm.pbf"\ndate = 2020-01-01\nsha256 = ["{"0" * 64}"]\n'

@@ -9,9 +9,9 @@ from dataclasses import replace
 import psutil
 import pytest
 
-from sasgeo_bench import progress
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core import progress
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.running import prediction_files, runner
 from sasgeo_bench.running.answers import Patience, pool_costs
 from sasgeo_bench.running.plan import RunRequest, plan_run

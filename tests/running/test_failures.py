@@ -5,8 +5,8 @@ import errno
 
 import pytest
 
-from sasgeo_bench.errors import StoreError
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.running.failures import LOG, Failures, stops_all
 
 

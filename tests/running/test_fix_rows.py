@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench.config import parse_toml
+from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import AnsweredTask, Card, Submission, example_card

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.leaderboard import board_files
-from sasgeo_bench.publishing import archive_file, release_files, site_files
+from sasgeo_bench.boards import archive_file, board_files, site_files
+from sasgeo_bench.exchange import release_files
 from sasgeo_bench.running import leak_scan, worker
 from sasgeo_bench.running.segmenting import SegmenterProcess
 from sasgeo_bench.running.worker import Limits, Reach, Worker

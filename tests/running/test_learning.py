@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.matching.matcher import check_learned
 from sasgeo_bench.running import prediction_files, sandbox, training

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.progress import Lines
 from sasgeo_bench.matching.tracker import check_prediction
-from sasgeo_bench.progress import Lines
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import sasgeo_bench as sgb
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.scaffold import package_files, write_plugin
 from sasgeo_bench.running.perturbation_testing import check_perturbation
 

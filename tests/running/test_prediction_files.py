@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.texts import json_text
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import RUN, Answers, CardRecord, RunManifest, StoredAnswers, rounded
 from sasgeo_bench.tasks.task_files import POSE_FIELDS
-from sasgeo_bench.texts import json_text
 
 POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
 FULL = Prediction(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import ConfigError, MatchError
+from sasgeo_bench.core.errors import ConfigError, MatchError
 from sasgeo_bench.running import leak_scan, prediction_files, sandbox
 from sasgeo_bench.running.plan import RunRequest, plan_run, reach_of
 from sasgeo_bench.running.testing import check_matcher

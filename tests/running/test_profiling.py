@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import pytest
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.progress import reporting
-from sasgeo_bench.publishing.profile_page import FIGURE, PAGE, RECORD, facts, write_profile
+from sasgeo_bench.boards.profile_page import FIGURE, PAGE, RECORD, facts, write_profile
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.running import profiling, sensors
 from sasgeo_bench.running.profiling import Fix, Profile, ProfileRequest, Reading, profile
 from sasgeo_bench.running.sensors import EnergyMeter, hottest_celsius, processor_name

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.running import answers, prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run

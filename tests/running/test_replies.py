@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.core.errors import MatchError
+from sasgeo_bench.core.texts import MOST_MESSAGE
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match, Prediction, check_match
 from sasgeo_bench.matching.tracker import ROW as ANSWER_ROW
 from sasgeo_bench.running import wire
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.query import Head
-from sasgeo_bench.texts import MOST_MESSAGE
 
 CARD = {
     **dict.fromkeys(("name", "version", "title", "source", "ours", "licence"), "mine"),

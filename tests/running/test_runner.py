@@ -13,9 +13,9 @@ from dataclasses import replace
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.scored import ScoreRequest
+from sasgeo_bench.boards.build import make_board
+from sasgeo_bench.boards.scored import ScoreRequest
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import answers, prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run

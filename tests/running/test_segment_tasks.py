@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugins import ORACLE_SEGMENTER
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.plugins import ORACLE_SEGMENTER
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running.plan import RunRequest, plan_run

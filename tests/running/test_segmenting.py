@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ImageError, MatchError
-from sasgeo_bench.files.plugins import ORACLE_SEGMENTER
+from sasgeo_bench.core.errors import ImageError, MatchError
+from sasgeo_bench.core.plugins import ORACLE_SEGMENTER
 from sasgeo_bench.running import sandbox
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
 from sasgeo_bench.running.worker import Limits

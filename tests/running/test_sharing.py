@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from sasgeo_bench.files.folders import locked
-from sasgeo_bench.progress import Lines, reporting
+from sasgeo_bench.core.folders import locked
+from sasgeo_bench.core.progress import Lines, reporting
 from sasgeo_bench.running import answers, prediction_files, runner, sandbox
 from sasgeo_bench.running.plan import RunRequest, by_map, plan_run
 from sasgeo_bench.running.prediction_files import RunManifest

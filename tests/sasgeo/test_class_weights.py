@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import (

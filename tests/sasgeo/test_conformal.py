@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.sasgeo.conformal import risk_threshold, upper_rate
 from sasgeo_bench.scoring.protection import supported_risk
 

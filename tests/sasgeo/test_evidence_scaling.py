@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.special import softmax
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.sasgeo.scorer_model import START, fit_scaling
 
 TRUE = np.array([0.02, 0.007, 0.01])

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
+from sasgeo_bench.core.texts import MOST_DIAGNOSTICS
 from sasgeo_bench.sasgeo.conformal import PROTECTION, levels_of
 from sasgeo_bench.sasgeo.integrity import EVIDENCE, EVIDENCE_NAMES, evidence_of
 from sasgeo_bench.search.plan import Null
-from sasgeo_bench.texts import MOST_DIAGNOSTICS
 from tests.sasgeo.simulated import modes_of
 
 OF_MODES = ("margin_nats", "posterior_entropy_nats", "modes_above", "spread_m", "class_agreement")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.matcher import Learner, Matcher, Training, check_match
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.conformal import PROTECTION

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.sasgeo.conformal import (
     PROTECTION,
     RISKS,

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, ClassRates, Tally, fit_rates, hand_rates, likeness, rings, tally
 

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.sasgeo.joint import Blend
 from sasgeo_bench.sasgeo.rates import FAR, hand_rates
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel

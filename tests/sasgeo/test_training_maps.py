@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.matcher import Training
 from sasgeo_bench.sasgeo import learning
 from sasgeo_bench.sasgeo.learning import around_views, on_maps_of_the_day, views_by_map

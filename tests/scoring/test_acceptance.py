@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.leaderboard.board_tables import acceptance_tables
+from sasgeo_bench.boards.board_tables import acceptance_tables
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.rejection import acceptance_frame
 from tests.scoring.test_tables import scores

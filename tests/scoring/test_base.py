@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import MetricError, SasgeoError
+from sasgeo_bench.core.errors import MetricError, SasgeoError
 from sasgeo_bench.scoring.base import block_codes, check_weights, codes_of, weighted_mean, weighted_quantile
 
 ROWS = st.lists(st.tuples(st.floats(-100, 100), st.integers(0, 4)), min_size=1, max_size=12)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest, chi2
 from statsmodels.stats.contingency_tables import mcnemar
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.scoring.compare import (
     RankInterval,
     distinguishable,

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.leaderboard.board_tables import contrast_table
+from sasgeo_bench.boards.board_tables import contrast_table
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.scoring import compare
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.intervals import wilson

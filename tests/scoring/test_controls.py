@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from sasgeo_bench.leaderboard.text import control_lines
+from sasgeo_bench.boards.text import control_lines
 from sasgeo_bench.scoring.controls import (
     at_least,
     chances,

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.scoring.cost import Costs, latency_quantile, map_kb_per_km2, per_fix
 from sasgeo_bench.scoring.tables import cost_figures

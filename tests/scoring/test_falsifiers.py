@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.leaderboard.board_tables import falsifier_table
+from sasgeo_bench.boards.board_tables import falsifier_table
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, hold_falsifiers
 from tests.scoring.test_tables import scores

@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sasgeo_bench.errors import ConfigError, MetricError
+from sasgeo_bench.boards.text import warnings_of
+from sasgeo_bench.core.errors import ConfigError, MetricError
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.leaderboard.text import warnings_of
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts, hold_contrasts
 from sasgeo_bench.scoring.flights import FLIGHT_COLUMNS, score_flights

@@ -8,9 +8,9 @@ from typing import Annotated
 import pandas as pd
 import pytest
 
-from sasgeo_bench.errors import StoreError
-from sasgeo_bench.files.parquet import read_frame
-from sasgeo_bench.leaderboard.board_files import SCHEMAS
+from sasgeo_bench.boards.board_files import SCHEMAS
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.parquet import read_frame
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
 from sasgeo_bench.scoring.frames import Schema, Shown, row_columns

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 import sasgeo_bench as sgb
-from sasgeo_bench.errors import ConfigError, MatchError, MetricError
+from sasgeo_bench.core.errors import ConfigError, MatchError, MetricError
 from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metric, find_metrics, measured
 from sasgeo_bench.scoring.metric_testing import check_metric, metric_files
 from sasgeo_bench.scoring.tables import leaderboard

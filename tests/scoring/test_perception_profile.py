@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError, MetricError
+from sasgeo_bench.core.errors import ConfigError, MetricError
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.scoring.perception_profile import measure_profile
 from sasgeo_bench.scoring.segmentation import PixelCounts

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import trapezoid
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose, inverse, wrap_deg
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.base import weighted_mean, weighted_quantile

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sasgeo_bench.leaderboard.board_tables import protection_tables
+from sasgeo_bench.boards.board_tables import protection_tables
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.sasgeo.conformal import METHODS, RISKS, SCALE, level_name
 from sasgeo_bench.scoring.intervals import wilson

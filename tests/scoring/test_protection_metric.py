@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.scoring.protection import (
     conformal_factor,

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.scoring.compare import detectable_difference
 from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts, registered
 from tests.scoring.test_tables import scores

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sasgeo_bench.leaderboard.board_tables import Book, scene_tables
+from sasgeo_bench.boards.board_tables import Book, scene_tables
 from sasgeo_bench.scoring.tables import AS_USED, leaderboard, scene_frame
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from tests.scoring.test_tables import scores

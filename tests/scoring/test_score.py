@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.score import COLUMNS, score_task, settle_not_applicable

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from sklearn.metrics import brier_score_loss, jaccard_score, precision_score, recall_score, roc_auc_score
 
-from sasgeo_bench.errors import MetricError, StoreError
-from sasgeo_bench.files.parquet import write_frame
+from sasgeo_bench.core.errors import MetricError, StoreError
+from sasgeo_bench.core.parquet import write_frame
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.scoring import segmentation as scoring
 from sasgeo_bench.scoring.segmentation import (

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import MetricError, StoreError
-from sasgeo_bench.files.parquet import write_frame
+from sasgeo_bench.core.errors import MetricError, StoreError
+from sasgeo_bench.core.parquet import write_frame
 from sasgeo_bench.scoring.segmentation import PixelCounts
 from sasgeo_bench.scoring.segmenter_board import SegmenterBoard, SegmenterTrial, page_tables, with_tables, write_board
 from sasgeo_bench.sensing.image import LabelledImage

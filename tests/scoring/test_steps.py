@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from sasgeo_bench.leaderboard.board_tables import step_tables
-from sasgeo_bench.leaderboard.plots import age_names, ages_frame
+from sasgeo_bench.boards.board_tables import step_tables
+from sasgeo_bench.boards.plots import age_names, ages_frame
 from sasgeo_bench.scoring.strata import queries_of, steps_frame, strata
 from sasgeo_bench.scoring.tables import leaderboard
 from tests.scoring.test_tables import scores

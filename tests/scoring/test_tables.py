@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sasgeo_bench.errors import MetricError
-from sasgeo_bench.leaderboard.board_tables import Book, summary
-from sasgeo_bench.leaderboard.manifests import BoardManifest
-from sasgeo_bench.leaderboard.tables import text_of
-from sasgeo_bench.leaderboard.text import MARKDOWN, Contents, board_latex, board_markdown, rows_of, warnings_of
+from sasgeo_bench.boards.board_tables import Book, summary
+from sasgeo_bench.boards.manifests import BoardManifest
+from sasgeo_bench.boards.tables import text_of
+from sasgeo_bench.boards.text import MARKDOWN, Contents, board_latex, board_markdown, rows_of, warnings_of
+from sasgeo_bench.core.errors import MetricError
+from sasgeo_bench.core.texts import markdown
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict
@@ -24,7 +25,6 @@ from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, with_entry_labe
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata
 from sasgeo_bench.scoring.tables import cost_figures, leaderboard
-from sasgeo_bench.texts import markdown
 
 ABOUT = BoardManifest(
     scorer_version=1, task_version=1, made_by="tests", split="crossfit", draws=200, entries=[], tasks=[]

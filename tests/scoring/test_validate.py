@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ShapeError, StoreError
+from sasgeo_bench.core.errors import ShapeError, StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.search.field import FULL, Field, Template

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import PoseError
+from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.search.dense import LevelView, surface

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError, ShapeError
+from sasgeo_bench.core.errors import ConfigError, ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.search import plan as plan_module

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import CameraError, ShapeError
+from sasgeo_bench.core.errors import CameraError, ShapeError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, cell_offsets_m
 from sasgeo_bench.sensing.accumulation import Errors, accumulate, believed_steps, steps_between

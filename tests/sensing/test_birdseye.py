@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import CameraError, ShapeError
+from sasgeo_bench.core.errors import CameraError, ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN

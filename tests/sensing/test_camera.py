@@ -9,7 +9,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sasgeo_bench.errors import CameraError
+from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
 from sasgeo_bench.sensing.ground import Dem, Plane

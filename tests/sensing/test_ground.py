@@ -9,7 +9,7 @@ import rasterio
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import CameraError
+from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.sensing import ground
 from sasgeo_bench.sensing.ground import Dem, Plane, read_dem

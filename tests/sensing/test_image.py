@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from sasgeo_bench.errors import ImageError
+from sasgeo_bench.core.errors import ImageError
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, decode_image
 

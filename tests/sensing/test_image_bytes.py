@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ImageError, StoreError
+from sasgeo_bench.core.errors import ImageError, StoreError
 from sasgeo_bench.sensing.image import (
     LabelledFiles,
     image_bytes,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import CameraError
+from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.sensing.camera import Intrinsics
 
 LENS = (-0.12, 0.03, 0.001, -0.0005, -0.004)

@@ -13,7 +13,7 @@ import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
-from sasgeo_bench.errors import CameraError, ImageError
+from sasgeo_bench.core.errors import CameraError, ImageError
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import decode_image
 from sasgeo_bench.sensing.photos import Lens, read_photo

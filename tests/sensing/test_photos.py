@@ -12,7 +12,7 @@ from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
 from benchmarks.photo_overlap import compare
-from sasgeo_bench.errors import CameraError, ImageError
+from sasgeo_bench.core.errors import CameraError, ImageError
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.photos import read_photo
 

@@ -11,8 +11,8 @@ import rasterio
 import shapely
 from rasterio.features import rasterize
 
-from sasgeo_bench.errors import ConfigError, ImageryError, StoreError
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.errors import ConfigError, ImageryError, StoreError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file

@@ -9,7 +9,7 @@ import pytest
 import rasterio
 import shapely
 
-from sasgeo_bench.errors import ImageryError
+from sasgeo_bench.core.errors import ImageryError
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sensing.reference_imagery import part_bounds_m, region_views, split_bounds

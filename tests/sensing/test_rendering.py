@@ -13,7 +13,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import CameraError, ConfigError, ShapeError
+from sasgeo_bench.core.errors import CameraError, ConfigError, ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.sensing.camera import Camera, Intrinsics

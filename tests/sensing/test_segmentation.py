@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from sasgeo_bench.errors import ImageError
+from sasgeo_bench.core.errors import ImageError
 from sasgeo_bench.sensing.segmentation import SILENT, Segmentation
 
 PLANES = arrays(np.uint8, array_shapes(min_dims=3, max_dims=3, max_side=6))

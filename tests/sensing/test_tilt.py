@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.road_tilt import SCENES, trial
-from sasgeo_bench.errors import CameraError
+from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.tilt import join_parallel, refine_tilt, road_borders

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import ConfigError, PoseError, StoreError
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.errors import ConfigError, PoseError, StoreError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks import build, flight_sampling, task_files
 from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.geometry.pose import reckon, wrap_deg
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.tasks import flight_sampling

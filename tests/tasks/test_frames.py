@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import CameraError, ImageError, ShapeError, StoreError
+from sasgeo_bench.core.errors import CameraError, ImageError, ShapeError, StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.sensing.accumulation import steps_between

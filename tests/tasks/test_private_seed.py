@@ -6,8 +6,8 @@ import os
 import pytest
 from sasgeo_paper import made_paper_task, make_paper_task
 
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, make_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record, take_seed

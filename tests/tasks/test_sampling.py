@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.spatial.distance import cdist
 
-from sasgeo_bench.config import shipped_dir
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import shipped_dir
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.regions import region_files

@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 
-from sasgeo_bench.canvas import DPI
+from sasgeo_bench.core.canvas import DPI
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence

@@ -9,8 +9,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import footprint

@@ -5,7 +5,7 @@ from collections import Counter
 
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import carry_out
 from sasgeo_bench.tasks.query import CONTROLS

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence, pack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE

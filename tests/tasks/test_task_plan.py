@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.config import shipped_dir
-from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.config import shipped_dir
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.suites.ages import AGES_YEARS, DAYS_PER_YEAR

@@ -18,9 +18,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import locked
-from sasgeo_bench.progress import reporting
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.folders import locked
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.tasks.build import check_task, is_of_region, make_tasks
 from sasgeo_bench.tasks.query import PriorGroup

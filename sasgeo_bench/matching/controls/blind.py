@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.core.texts import MOST_CANDIDATES
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.texts import MOST_CANDIDATES
 
 
 def is_blind(query: Query) -> bool:

@@ -17,7 +17,7 @@ from osmium.osm.mutable import Node as OsmNode
 from osmium.osm.mutable import Relation as OsmRelation
 from osmium.osm.mutable import Way as OsmWay
 
-from sasgeo_bench.errors import ExtractError, SasgeoError
+from sasgeo_bench.core.errors import ExtractError, SasgeoError
 from sasgeo_bench.geometry.projection import WGS84
 from sasgeo_bench.osm.synthetic.morphology import Morphology, draw
 from sasgeo_bench.osm.synthetic.sketch import Line, Sketch, Tags, join_streets

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.sensing.rendering.plan import Picture
 from sasgeo_bench.sensing.rendering.seasons import SEASONS, Season, season_of
 from sasgeo_bench.sensing.rendering.texture import Field
@@ -96,7 +96,7 @@ class Conditions:
     >>> Conditions(sun=Sun(elevation_deg=40.0, azimuth_deg=150.0), cloud=2.0)
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: cloud lies within 0 and 1, got 2.0
+    sasgeo_bench.core.errors.ConfigError: cloud lies within 0 and 1, got 2.0
     """
 
     sun: Sun = Sun(elevation_deg=45.0, azimuth_deg=150.0)

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.layers import burn, burn_class, make_paint
 from sasgeo_bench.sensing.rendering.buildings import Buildings, paint_buildings, style_buildings

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import CameraError
+from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.sensing.camera import Camera

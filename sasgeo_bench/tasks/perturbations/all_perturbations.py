@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from typing import Any, Final
 
-from sasgeo_bench.errors import MatchError
-from sasgeo_bench.files.plugins import PERTURBATIONS as GROUP
-from sasgeo_bench.files.plugins import find_inside
+from sasgeo_bench.core.errors import MatchError
+from sasgeo_bench.core.plugins import PERTURBATIONS as GROUP
+from sasgeo_bench.core.plugins import find_inside
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.perturbations.base import Perturbation
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, RowJitter, Tilt
@@ -69,8 +69,8 @@ def find_perturbation(spec: str) -> object:
     >>> find_perturbation("boarder")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.MatchError: there is no perturbation 'boarder', did you mean 'border'? (list perturbations shows
-    all; or module:NAME)
+    sasgeo_bench.core.errors.MatchError: there is no perturbation 'boarder', did you mean 'border'? (list
+    perturbations shows all; or module:NAME)
     """
     found = SHIPPED[spec] if spec in SHIPPED else find_inside(spec, GROUP, shipped=SHIPPED)
     ladder_of(found, spec)

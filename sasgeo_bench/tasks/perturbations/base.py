@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import PerturbError
+from sasgeo_bench.core.errors import PerturbError
 from sasgeo_bench.geometry.pose import rotation
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.streams import Streams

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import ClassErrors, load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import (

@@ -13,10 +13,10 @@ from typing import Annotated, Final, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from sasgeo_bench.config import Document, Line, Short, parse_toml
-from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.core.config import Document, Line, Short, parse_toml
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.osm.taxonomy import MeasuredErrors, load_taxonomy
 from sasgeo_bench.tasks.perturbations.measured import MEASURED
 

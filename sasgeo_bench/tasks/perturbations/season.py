@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import PerturbError
+from sasgeo_bench.core.errors import PerturbError
 from sasgeo_bench.osm.taxonomy import Season as Kind
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence

@@ -4,9 +4,9 @@
 from functools import lru_cache
 from typing import Final
 
-from sasgeo_bench.errors import ConfigError, MatchError
-from sasgeo_bench.files.plugins import SUITES as GROUP
-from sasgeo_bench.files.plugins import check_own_name, find_inside, list_entry_points, made, plugin_code
+from sasgeo_bench.core.errors import ConfigError, MatchError
+from sasgeo_bench.core.plugins import SUITES as GROUP
+from sasgeo_bench.core.plugins import check_own_name, find_inside, list_entry_points, made, plugin_code
 from sasgeo_bench.tasks.query import BY
 from sasgeo_bench.tasks.suites import ages, board_controls, flights, pictures, twins, views
 from sasgeo_bench.tasks.suites.base import Suite
@@ -92,7 +92,7 @@ def find_suite(spec: str) -> Suite:
     >>> find_suite("cleen")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: there is no suite 'cleen', did you mean 'clean'? (list suites shows all; or
+    sasgeo_bench.core.errors.ConfigError: there is no suite 'cleen', did you mean 'clean'? (list suites shows all; or
     module:NAME)
     """
     return _foreign(spec) if is_foreign(spec) else EVERY_SUITE[spec]

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.split import Block

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import Season as Kind
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence

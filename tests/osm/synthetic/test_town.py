@@ -11,7 +11,7 @@ import osmium
 import pytest
 import shapely
 
-from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.core.errors import ExtractError
 from sasgeo_bench.osm.synthetic.morphology import Morphology
 from sasgeo_bench.osm.synthetic.sketch import Way, join_streets
 from sasgeo_bench.osm.synthetic.town import BULK_REDRAW, TownPlan, write_town

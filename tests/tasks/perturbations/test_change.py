@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import PerturbError
+from sasgeo_bench.core.errors import PerturbError
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.perturbations.base import find_objects, pick_up_to, shifted

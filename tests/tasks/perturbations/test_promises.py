@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import PerturbError
+from sasgeo_bench.core.errors import PerturbError
 from sasgeo_bench.running.perturbation_testing import NO_STRENGTHS, promises
 from sasgeo_bench.tasks.perturbations.all_perturbations import SHIPPED, ladder_of
 from sasgeo_bench.tasks.perturbations.base import share_changed

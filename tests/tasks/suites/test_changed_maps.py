@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks import flight_sampling

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.tasks.perturbations.perception import Perception

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.scaffold import package_files
 from sasgeo_bench.running.suite_testing import check_suite
 from sasgeo_bench.tasks.build import made_tasks, make_tasks

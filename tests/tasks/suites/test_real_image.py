@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, observe
 from sasgeo_bench.regions.region_files import read_region

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.split import blocks_of
 from sasgeo_bench.tasks.suites.all_suites import SUITES

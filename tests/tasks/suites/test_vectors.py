@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, Evidence, cell_offsets_m

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board's folder -> its site: the order of the steps."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+
+from sasgeo_bench.ageing.ratebook import load_ratebook
+from sasgeo_bench.boards.archive import request_of, score_all
+from sasgeo_bench.boards.archive_file import is_pack
+from sasgeo_bench.boards.board import Board, by_entry
+from sasgeo_bench.boards.board_files import (
+    BOARD_FILES,
+    FIGURES,
+    csv_text,
+    read_leaderboard,
+)
+from sasgeo_bench.boards.manifests import PipelineRecord
+from sasgeo_bench.boards.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
+from sasgeo_bench.boards.private_board import check_public
+from sasgeo_bench.boards.site import site_pages
+from sasgeo_bench.boards.site_files import (
+    MOST_BYTES,
+    BoardFiles,
+    Download,
+    SiteFigure,
+    SiteSource,
+    Spot,
+    Written,
+    draw_text,
+    held,
+    read_board_files,
+    site_lock,
+    write_site,
+)
+from sasgeo_bench.boards.site_maps import draw_places, draw_rates, places_on_map, regions_of
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.folders import SITE, absolute, resolve_link, scratch_folder
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import one_line
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.intervals import DRAWS
+from sasgeo_bench.scoring.score import COLUMNS as SCORED
+from sasgeo_bench.scoring.strata import GROUP
+from sasgeo_bench.scoring.tables import scene_frame
+from sasgeo_bench.tasks.split import find_split_file, read_split_file
+
+_MAP: Final = "places.svg"
+_RATES: Final = "ageing-rates.svg"
+_OF_SCENES: Final = (
+    *(*GROUP, "kind_of_place", "matcher", "metric", "n", "blocks", "places"),
+    *("value", "lo", "hi", "lo_blocks", "hi_blocks", "interval", "rank_best", "rank_worst"),
+)
+
+
+def publish(board: Path, into: Path | None = None, *, root: Path = Path("out"), jobs: int = 1) -> Written:
+    """Make the site of a board from its folder; stored results are scored again for their figures and pictures.
+
+    `into` is the folder to write, by default `site` in the board's own. Pictures of stored results, which hold no
+    views, come from regions/, tasks/ and truth/ below `root`. `jobs` counts the processes that score. Raise
+    `StoreError` if there is no sound board or the site cannot be written, and an older site then stays as it was;
+    `ConfigError` if the board is of a private seed.
+    """
+    if into is None and (board / SITE).is_symlink():
+        raise StoreError(f"{board / SITE} is a link: name where it leads with --into")
+    target = board / SITE if into is None else resolve_link(into)
+    place, whole = Path(os.path.realpath(absolute(target).parent)) / absolute(target).name, board.resolve()
+    if place == whole or (place.is_relative_to(whole) and place != whole / SITE):
+        raise StoreError(
+            f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
+        )
+    with held(board, target, root=root), _with_figures(board, root, jobs) as folder:
+        with _sound(board):
+            files = read_board_files(folder)
+        check_public(files.board.about.private_seed, str(board))
+        with _sound(board):
+            scenes = _scenes(files.board)
+            files = replace(files, downloads=(*files.downloads, *_scenes_file(scenes)))
+            source = replace(_source(files), scenes=scenes)
+            pages = site_pages(source)
+        with site_lock(board, target):
+            written = write_site(
+                target,
+                files,
+                pages=pages,
+                figures=filter(None, (*source.figures, source.rates_figure, source.map_figure)),
+                name=source.name,
+            )
+    if written.site_bytes > MOST_BYTES:
+        tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB without pictures and downloads: slow to open from afar")
+    return written
+
+
+@contextmanager
+def _with_figures(board: Path, root: Path, jobs: int) -> Iterator[Path]:
+    """Yield the folder of a board with figures: stored results are scored into one that goes when the block ends."""
+    if not is_pack(board) or (board / FIGURES).is_dir():  # results of a former layout hold their figures
+        yield board
+        return
+    tell(f"{board}: scoring stored results again, for their figures")
+    with scratch_folder("answers") as scratch:
+        folder = scratch / board.resolve().name
+        request = replace(request_of([board], board=folder, root=root), jobs=jobs)
+        score_all(request)
+        if not read_leaderboard(folder).equals(read_leaderboard(board)):
+            tell(f"the site shows the tables of this version, which differ from those in {board}: store them anew")
+        for name in BOARD_FILES:  # those of the paper's experiment are made where it is run
+            if (board / name).is_file() and not (folder / name).exists():
+                shutil.copyfile(board / name, folder / name)
+        yield folder
+
+
+@contextmanager
+def _sound(board: Path) -> Iterator[None]:
+    """Turn errors in tables or values of a board, which anybody may have made, into a `StoreError` that names it."""
+    try:
+        yield
+    except StoreError as error:
+        raise StoreError(
+            str(error) if str(board) in str(error) else f"{board} holds a damaged board: {error}"
+        ) from error
+    except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
+        text = one_line(repr(error))
+        raise StoreError(f"{board} holds a board that no page can be made of ({text}): score it again") from error
+
+
+def _source(files: BoardFiles) -> SiteSource:
+    """Return the content of all pages, with figures of places and rates drawn for them."""
+    about, name = files.board.about, _name_of(files.board)
+    spec = _pipeline_of(about.pipeline)
+    spots, parts = _spots(), _parts(about.split)
+    lost = [region for region in regions_of(about.tasks) if region not in spots]
+    if lost:
+        tell(f"not on the map of places, for no region of that name ships: {', '.join(lost)}")
+    places = places_on_map(about.tasks, spots, parts)
+    book = load_ratebook()
+    drawing: dict[str, Callable[[Path], None]] = {_RATES: partial(draw_rates, book=book)}
+    if places:
+        drawing[_MAP] = partial(draw_places, places=places)
+    with scratch_folder("figures") as folder:
+        drawn = {file: SiteFigure.of(file, draw_text(draw, folder)) for file, draw in drawing.items()}
+    return SiteSource(
+        name=name,
+        title=about.title or (name if spec is None else spec.title),
+        board=files.board,
+        rates=book,
+        registered=_registered(files, spec),
+        reasons={} if spec is None else {item.name: " ".join(item.why.split()) for item in spec.contrast},
+        figures=files.figures,
+        downloads=files.downloads,
+        pictures=files.pictures,
+        spots=spots,
+        parts=parts,
+        rates_figure=drawn[_RATES],
+        map_figure=drawn.get(_MAP),
+    )
+
+
+def _scenes(board: Board) -> pd.DataFrame:
+    """Return success by kind of place from the board's own scored rows; empty where these do not tell."""
+    scores = board.scores
+    if not set(SCORED) <= set(scores):
+        return pd.DataFrame()
+    apart = {entry.name for entry in board.about.entries if entry.set_apart}
+    return scene_frame(by_entry(scores), draws=board.about.draws or DRAWS, excluded=apart)
+
+
+def _scenes_file(scenes: pd.DataFrame) -> Iterator[Download]:
+    if len(scenes):
+        table = scenes.rename(columns={"stratum": "kind_of_place"})[list(_OF_SCENES)]
+        what = "success by kind of place, with intervals by places and by blocks"
+        yield Download(file="kinds-of-place.csv", data=csv_text(table).encode(), what=what)
+
+
+def _name_of(board: Board) -> str:
+    pipeline = board.about.pipeline
+    return pipeline.id if pipeline is not None else board.folder.resolve().name
+
+
+def _pipeline_of(pipeline: PipelineRecord | None) -> PipelineFile | None:
+    """Return the shipped pipeline that a board was made by; None for any other, even of the same name."""
+    if pipeline is None:
+        return None
+    try:
+        spec = read_pipeline_file(find_pipeline_file(pipeline.id))
+    except ConfigError:
+        return None
+    return spec if spec.sha256 == pipeline.sha256 else None
+
+
+def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast, ...]:
+    """Return contrasts as registered: from the board, its stored settings, or its pipeline."""
+    if files.board.about.contrasts:
+        return tuple(files.board.about.contrasts)
+    if files.settings is not None:
+        return tuple(files.settings.contrasts)
+    return () if spec is None else tuple(item.registered for item in spec.contrast)
+
+
+def _spots() -> dict[str, Spot]:
+    """Return the places of the shipped regions."""
+    found = {}
+    for name, path in list_region_files().items():
+        spec = read_region_file(path)
+        west, south, east, north = spec.lonlat_box()
+        found[name] = Spot(
+            region=name,
+            title=spec.title,
+            longitude_deg=(west + east) / 2,
+            latitude_deg=(south + north) / 2,
+            scenes=tuple(spec.scenes),
+            is_made_up=any(item.town is not None for item in spec.extract),
+        )
+    return found
+
+
+def _parts(split: str | None) -> dict[str, tuple[str, str]]:
+    """Return, by region of a shipped split, its place and its half or part; nothing for another split."""
+    try:
+        spec = read_split_file(find_split_file(split or ""))
+    except ConfigError:
+        return {}
+    return {region: (place.name, place.half or place.part or "") for place in spec.place for region in place.region_ids}

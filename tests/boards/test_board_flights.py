@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board of flights: figures along the way, maps of a flight, its page, and stored results that give it again."""
+
+import json
+from dataclasses import replace
+
+import cv2
+import pandas as pd
+import pytest
+
+from sasgeo_bench.boards.board_files import read_leaderboard, read_scores
+from sasgeo_bench.boards.board_pictures import FLIGHT_BYTES
+from sasgeo_bench.boards.publish import publish
+from sasgeo_bench.cli.boards import score
+from sasgeo_bench.matching.matcher import Prediction
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.prediction_files import RunManifest
+from sasgeo_bench.tasks import flight_sampling, task_files
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+
+SUITE, REGION = "flight-overconfident", "town-riverside"
+HASH = "0" * 12
+SURE = (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0, 0.0, 4.0)
+
+
+def quiet(_):
+    return None
+
+
+def run(out, name, *, off_m, accepts):
+    """Write the answers of a tracker that is so far off, and accepts every view whose number `accepts` takes."""
+    task, truths = out / "tasks" / SUITE / REGION, task_files.read_truths(out / "truth" / SUITE / REGION)
+    answers = []
+    for number, truth in enumerate(truths):
+        pose = replace(truth.pose, northing_m=truth.pose.northing_m + off_m)
+        answers.append(
+            Prediction(
+                query_id=truth.query_id,
+                candidates=((pose, 1.0),),
+                is_accepted=accepts(number),
+                covariance=SURE,
+                latency_s=0.1,
+            )
+        )
+    folder = out / "runs" / name / HASH / SUITE / REGION
+    prediction_files.write_part(folder, answers, asked=task_files.Task.open(task).asked)
+    about = {"matcher": {"name": name, "version": "1"}, "hash": HASH, "suite": SUITE, "region": REGION}
+    sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
+    RunManifest(**about, queries_sha256=sha256, cpu_s=3.0).save(folder)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory, lay_towns):
+    """A root with two trackers, their board in boards/mine, and its stored results in results/mine."""
+    root = lay_towns(tmp_path_factory.mktemp("flights") / "out", REGION)
+    wanted = Wanted(suites=(SUITE,), regions=(REGION,), split="crossfit", count=2, seed=0, out=root, may_be_fewer=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
+        for request in plan_requests(wanted):
+            make_tasks(request)
+    run(root, "near", off_m=3.0, accepts=lambda _: True)
+    run(root, "far", off_m=40.0, accepts=lambda number: number % 2 == 0)
+    score(predictions=root / "runs", out=root, name="mine", draws=100, results=root / "results")
+    return root
+
+
+def test_figures_of_flights_stand_on_the_board(out):
+    table = read_leaderboard(out / "boards" / "mine")
+    whole = table[table["stratum"] == "all"].set_index(["matcher", "metric"])["value"]
+    assert (whole["near", "distance_within_25m"], whole["far", "distance_within_25m"]) == (1.0, 0.0)
+    assert (whole["near", "false_accepted"], whole["far", "distance_within_50m"]) == (0.0, 1.0)
+    assert 0.4 < whole["far", "false_accepted"] < 0.6
+    assert whole["near", "right_accepted"] == 1.0
+    costs = table[table["suite"] == "all suites"].set_index(["matcher", "metric"])
+    assert costs.loc[("near", "latency_p50"), "value"] == 0.1
+    views = costs.loc[("near", "cpu_per_fix"), "n"]
+    assert costs.loc[("near", "cpu_per_fix"), "value"] == pytest.approx(3.0 / views)
+    assert costs.loc[("far", "cpu_per_fix"), "value"] > 1.5 * costs.loc[("near", "cpu_per_fix"), "value"]
+
+
+def test_a_flight_is_a_row_and_not_a_view(out):
+    rows = read_scores(out / "boards" / "mine")
+    truths = list(task_files.read_truths(out / "truth" / SUITE / REGION))
+    assert len(rows) == 2 * len({truth.query_id[:-6] for truth in truths})
+    assert rows["views"].sum() == 2 * len(truths)
+    assert (rows["track"] == "sequence").all()
+
+
+def test_errors_along_the_way_and_how_rarely_the_map_may_be_asked_are_drawn(out):
+    names = {path.name.split("-")[0] for path in (out / "boards" / "mine" / "figures").glob("*.svg")}
+    assert {"distance", "interval", "drift", "stress", "price"} <= names
+    assert not {"errors", "recall", "risk", "cost"} & names
+    (drawn,) = (out / "boards" / "mine" / "figures").glob("distance-*.svg")
+    text = drawn.read_text(encoding="utf-8")
+    assert "Error along the way" in text
+    assert ">1000<" in text
+
+
+def test_a_flight_is_shown_with_a_map_for_each_tracker(out):
+    board = out / "boards" / "mine"
+    (flight,) = json.loads((board / "pictures" / "pictures.json").read_text(encoding="utf-8"))["flights"]
+    assert flight["suite"] == SUITE
+    assert flight["alt"].endswith("with the estimates of far, near")
+    path = board / "pictures" / flight["file"]
+    assert path.stat().st_size <= FLIGHT_BYTES
+    assert cv2.imread(str(path)).shape[1] > 700
+
+
+@pytest.mark.usefixtures("plain_site")
+def test_the_page_of_a_suite_has_its_table_figures_and_flight(out):
+    publish(out / "boards" / "mine", root=out)
+    (page,) = (out / "boards" / "mine" / "site").glob(f"suite*{SUITE}*.html")
+    text = page.read_text(encoding="utf-8")
+    for shown in ("distance_within_25m", "false_accepted", f"flights/{SUITE}.webp", "distance-"):
+        assert shown in text
+
+
+def test_stored_results_give_the_same_board(out):
+    again = score(predictions=out / "results" / "mine", out=out, name="again", draws=100, cases=False)
+    first, second = (
+        frame.sort_values(["matcher", "suite", "stratum", "metric"], ignore_index=True)
+        for frame in (read_leaderboard(out / "boards" / "mine"), again.leaderboard)
+    )
+    columns = ["matcher", "suite", "stratum", "metric", "n", "value", "lo", "hi"]
+    pd.testing.assert_frame_equal(first[columns], second[columns], check_dtype=False)
+
+
+def test_a_run_of_flights_is_listed_and_its_worst_flight_drawn(out, program):
+    code, told, _ = program("inspect", str(out / "runs" / "far"), "--out", str(out))
+    assert code == 0
+    assert "far: 6 flights, the worst first (--query draws one)" in told
+    path = told.rpartition("map of the worst flight: ")[2].strip()
+    assert cv2.imread(path).shape[1] > 300
+    flight = read_scores(out / "boards" / "mine")["query_id"].iloc[0]
+    code, told, _ = program("inspect", str(out / "runs" / "far"), "--query", flight[:10], "--out", str(out))
+    assert (code, told) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")
+
+
+def test_a_flight_is_named_by_a_beginning_or_a_view_of_its_own_and_by_nothing_else(out, program):
+    run_folder = str(out / "runs" / "far")
+    flight = read_scores(out / "boards" / "mine")["query_id"].iloc[0]
+    code, told, _ = program("inspect", run_folder, "--query", f"{flight}000003", "--out", str(out))
+    assert (code, told) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")
+    for query, why in (("", "--query is empty"), ("../../", "was asked no query"), ("zz", "was asked no query")):
+        code, _, err = program("inspect", run_folder, "--query", query, "--out", str(out))
+        assert code == 2
+        assert why in err

@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stored results: they are of the file that is registered, small, and the page about them says what they say."""
+
+import json
+import re
+import runpy
+from pathlib import Path
+
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+
+from sasgeo_bench.boards.archive import stored_settings
+from sasgeo_bench.boards.archive_file import MOST_BYTES
+from sasgeo_bench.boards.pipeline_spec import find_pipeline_file, read_pipeline_file
+from sasgeo_bench.scoring.segmenter_board import SegmenterBoard, page_tables, with_tables
+from sasgeo_bench.tasks.query import PUBLISHED
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+PAGES = sorted(RESULTS.glob("*.md"))
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
+BOARDS = sorted(path.parent.name for path in RESULTS.glob("*/board.json"))
+SEGMENTERS = RESULTS / "segmenters"
+PROGRAM = re.compile(r"```python\n(.*?)```\n\n```text\n(.*?)```", re.DOTALL)
+ROW = re.compile(r"^\|(?!---).*\|$", re.MULTILINE)
+
+pytestmark = pytest.mark.skipif(not BOARDS, reason="no results are stored yet")
+
+
+def test_there_are_results_of_the_registered_experiment():
+    assert {"claims", "modules"} <= set(BOARDS)
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_results_are_of_the_pipeline_as_it_is_registered(name):
+    spec = read_pipeline_file(find_pipeline_file(name))
+    assert stored_settings([RESULTS / name]).pipeline == spec.identity
+    said = json.loads((RESULTS / name / "board.json").read_text(encoding="utf-8"))
+    assert {entry["name"] for entry in said["entries"]} >= set(spec.matchers) - {"oracle_pose"}
+
+
+def test_results_are_small():
+    assert sum(path.stat().st_size for path in RESULTS.rglob("*") if path.is_file()) < len(BOARDS) * MOST_BYTES
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_all_controls_held(name):
+    assert pd.read_parquet(RESULTS / name / "controls.parquet")["holds"].all()
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_stored_truths_are_of_the_detectors_that_the_pipeline_names(name):
+    """Truths of older boards have no column that would say so: they count as of the published one."""
+    path = RESULTS / name / "truths.parquet"
+    has_column = "detector" in pq.read_schema(path).names
+    column = pq.read_table(path, columns=["detector"])["detector"].to_pylist() if has_column else [PUBLISHED]
+    named = {detector for item in read_pipeline_file(find_pipeline_file(name)).task for detector in item.detectors}
+    assert named <= set(column) <= named | {PUBLISHED}  # the controls of every board are of the published one
+
+
+@pytest.fixture(scope="module")
+def tables_of_pictures():
+    """The lines that the program of the page on pictures prints of its boards."""
+    program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "sim_to_real.py"))
+    lines = []
+    for board, matcher in (("aerial", "sasgeo"), ("aerial-soft", "raster_soft")):
+        scores = program["read_scores"](RESULTS / board, 25.0, 5.0)
+        suites = sorted(set(scores["suite"]) - {"real-image"})
+        lines += [*program["by_evidence"](scores), *program["by_difference"](scores)]
+        lines += program["by_suite"](scores, suites, matcher)
+    return {row.rstrip() for line in lines for row in line.splitlines()}
+
+
+@pytest.fixture(scope="module")
+def table_of_losses():
+    """The lines that the program of the page on flights prints of its boards."""
+    program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "lost_flights.py"))
+    boards = (RESULTS / name for name in ("flights", "countries"))
+    rows = [row for board in boards for row in program["lines"](program["flights_of"](board, "flight-real-age"))]
+    return {*program["HEAD"].splitlines(), *rows}
+
+
+@pytest.fixture(scope="module")
+def table_of_systems():
+    """The lines that the program of the paper's table prints of the board of systems."""
+    program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "related_work.py"))
+    return set(program["lines"](*program["read_board"](RESULTS / "systems")))
+
+
+@pytest.mark.slow
+def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures, table_of_losses, table_of_systems):
+    boards = {line for path in RESULTS.glob("*/leaderboard.md") for line in path.read_text("utf-8").splitlines()}
+    boards |= tables_of_pictures | table_of_losses | table_of_systems
+    rows = {page.stem: ROW.findall(text) for page, text in TEXTS.items()}
+    del rows[SEGMENTERS.name], rows["README"]  # held as wholes, and figure by figure, below
+    assert sum(map(len, rows.values())) > 100
+    assert {page: [row for row in some if row not in boards] for page, some in rows.items()} == {
+        page: [] for page in rows
+    }
+
+
+def test_some_pages_have_programs():
+    assert len([page for page, text in TEXTS.items() if PROGRAM.search(text)]) > 3
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if PROGRAM.search(TEXTS[page])], ids=lambda path: path.stem)
+def test_every_program_on_the_pages_prints_what_they_say(page, monkeypatch, capsys):
+    monkeypatch.chdir(RESULTS.parents[1])
+    for program, said in PROGRAM.findall(TEXTS[page]):
+        exec(program, {})  # noqa: S102 - of our own page
+        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == said.splitlines()
+
+
+@pytest.fixture(scope="module")
+def segmenters():
+    """The stored board of segmenters."""
+    return SegmenterBoard.read(SEGMENTERS)
+
+
+@pytest.fixture(scope="module")
+def tables_of_segmenters(segmenters):
+    """Its tables, as they stand on a page."""
+    return page_tables(segmenters)
+
+
+def test_the_tables_of_segmenters_are_those_of_their_board(segmenters, tables_of_segmenters):
+    text = (SEGMENTERS / "leaderboard.md").read_text(encoding="utf-8")
+    assert with_tables(text, segmenters) == text
+    titles = re.findall("^## .*", tables_of_segmenters, re.MULTILINE)
+    assert titles == re.findall("^## .*", text, re.MULTILINE)
+    shown = [row for row in ROW.findall((RESULTS / "segmenters.md").read_text(encoding="utf-8")) if "[" in row]
+    assert len(shown) > 10
+    assert [row for row in shown if row not in tables_of_segmenters] == []
+
+
+def test_figures_with_intervals_in_the_prose_about_segmenters_stand_in_its_tables(tables_of_segmenters):
+    text = (RESULTS / "segmenters.md").read_text(encoding="utf-8")
+    prose = " ".join(" ".join(line for line in text.splitlines() if not line.startswith("|")).split())
+    found = re.findall(r"\d\.\d{3} \[\d\.\d{3}, \d\.\d{3}\]", prose)
+    assert len(found) > 10
+    assert [figure for figure in found if figure not in tables_of_segmenters] == []
+
+
+def test_the_table_about_shares_among_the_concepts_is_of_the_board_of_segmenters(segmenters):
+    text = (RESULTS.parent / "concepts" / "segmenters.md").read_text(encoding="utf-8")
+    scores = segmenters.scores
+    scores = scores[(scores["group"] == "all") & (scores["tested_on"] == "zanzibar")]
+    found = scores.set_index(["segmenter", "learned_from", "shares", "metric"])["value"]
+    columns = (
+        ("plain", "auc"),
+        ("plain", "iou"),
+        ("plain", "ece"),
+        ("picture", "iou"),
+        ("flight", "iou"),
+        ("flight", "ece"),
+    )
+    trials = {"-": "-", "rendered": "rendered", "zanzibar": "the other three blocks"}
+    for segmenter, learned in (("colour_thresholds", "-"), ("pixel_forest", "rendered"), ("pixel_forest", "zanzibar")):
+        figures = " | ".join(f"{found[segmenter, learned, shares, metric]:.3f}" for shares, metric in columns)
+        assert f"| `{segmenter}` | {trials[learned]} | {figures} |" in text
+
+
+def test_the_stored_board_of_segmenters_is_small_and_each_trial_has_a_profile(segmenters):
+    assert sum(path.stat().st_size for path in SEGMENTERS.rglob("*.*") if path.is_file()) < 1_000_000
+    assert len(segmenters.profiles) == len(segmenters.runs)
+    for (segmenter, _, _), rows in segmenters.scores.groupby(["segmenter", "learned_from", "tested_on"]):
+        assert {profile.segmenter for profile in segmenters.profiles.values()} >= {segmenter}
+        assert set(rows.loc[rows["group"] == "all", "shares"]) == {"plain", "picture", "flight"}
+
+
+@pytest.mark.parametrize(
+    ("page", "board", "unsaid"),
+    [
+        ("README", "modules", set()),
+        ("pictures", "aerial-soft", set()),
+        ("flights", "flights", set()),
+    ],
+)
+def test_the_claims_on_a_page_are_the_differences_and_intervals_of_its_board(page, board, unsaid):
+    text = " ".join((RESULTS / f"{page}.md").read_text(encoding="utf-8").split())
+    found = pd.read_parquet(RESULTS / board / "contrasts.parquet").set_index("name")
+    for name in set(found.index) - unsaid:
+        row = found.loc[name]
+        far = "" if pd.isna(row.get("lo_countries")) else "_countries"  # the interval that decides
+        difference, lo, hi = (100 * row[column] for column in ("difference", f"lo{far}", f"hi{far}"))
+        assert f"{difference:+.1f} points [{lo:.1f}, {hi:.1f}]" in text, name
+
+
+def test_the_verdicts_that_the_pages_put_into_words_are_those_of_the_boards():
+    outcomes = {
+        board: pd.read_parquet(RESULTS / board / "contrasts.parquet").set_index("name")["outcome"] for board in BOARDS
+    }
+    said = {
+        "modules": {
+            **dict.fromkeys(("graph-junctions", "graph-instances"), "decided"),
+            **dict.fromkeys(("graph-levels", "graph-warp", "learned-age", "prior-age", "prior-lure"), "not decided"),
+            **dict.fromkeys(("age", "unknown", "correlation", "shift"), "not decided"),
+            **dict.fromkeys(("rejection-alias", "rejection-absent"), "not decided"),
+        },
+        "claims": {
+            **dict.fromkeys(("graph-warp", "graph-junctions", "graph-instances", "graph-levels", "unknown"), "decided"),
+            **dict.fromkeys(("stability-age", "stability-lure", "rejection-alias"), "not decided"),
+            **dict.fromkeys(("age", "age-interaction", "old-maps", "age-fresh"), "not decided"),
+            "rejection-absent": "null",
+        },
+        "flights": {
+            **dict.fromkeys(("odometry", "stability"), "cause open"),
+            **dict.fromkeys(("none", "age"), "not decided"),
+            "odometry-stress": "decided",
+            "diffusion": "null",
+        },
+    }
+    for board, words in said.items():
+        assert outcomes[board][list(words)].to_dict() == words

@@ -25,11 +25,11 @@ from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, count
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.matcher import SAME_PLACE_M, Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.layers import read_layers
-from sasgeo_bench.running.prediction_files import RUN, Answers, RunManifest, read_ties
+from sasgeo_bench.running.prediction_files import CANDIDATE_M, RUN, Answers, RunManifest, read_ties
 from sasgeo_bench.sasgeo.integrity import EVIDENCE
 from sasgeo_bench.scoring.controls import is_control
 from sasgeo_bench.scoring.entries import Entry, find_entries
@@ -214,7 +214,7 @@ def _right_candidate(case: Case) -> str:
     at = [
         number
         for number, pose in enumerate(poses, start=1)
-        if math.hypot(pose.easting_m - place.easting_m, pose.northing_m - place.northing_m) <= SAME_PLACE_M
+        if math.hypot(pose.easting_m - place.easting_m, pose.northing_m - place.northing_m) <= CANDIDATE_M
     ]
     return f"{at[0] if at else 'not'} in the list of {len(poses)}"
 

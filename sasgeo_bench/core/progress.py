@@ -16,6 +16,7 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from signal import SIG_DFL, SIGINT, signal
 from threading import Thread
+from types import FunctionType
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeVar, cast
 
 from sasgeo_bench.core.errors import ConfigError, StoreError
@@ -163,13 +164,28 @@ def reporting(tell: Tell | None = None, progress: Progress | None = None) -> Ite
 
 
 def reported(work: Callable[[Item], Found]) -> Callable[[Item], Found]:
-    """Return work that reports to whoever listens here from another process, too."""
-    return partial(_reported, work, _outlet.tell)
+    """Return work for `spread` that reports to whoever listens here from another process, too.
+
+    A function that other processes can import is told each line at once, anything else when the item is done.
+    """
+    named = isinstance(_outlet.tell, FunctionType) and "<" not in _outlet.tell.__qualname__
+    return partial(_reported, work, _outlet.tell if named else None, os.getpid())
 
 
-def _reported(work: Callable[[Item], Found], tell: Tell, item: Item) -> Found:
-    with reporting(tell):
+class _Reported(NamedTuple, Generic[Found]):
+    """A result, and what was told on the way."""
+
+    lines: list[str]
+    found: Found
+
+
+def _reported(work: Callable[[Item], Found], tell: Tell | None, parent: int, item: Item) -> Found:
+    if os.getpid() == parent:  # who listens there listens already
         return work(item)
+    lines: list[str] = []
+    with reporting(tell or lines.append):
+        found = work(item)
+    return found if tell else cast("Found", _Reported(lines, found))
 
 
 def check_jobs(jobs: int) -> None:
@@ -247,6 +263,10 @@ def spread(
     if label:
         begin(label, len(items))
     for found in _found(work, items, jobs) if dask is None else _found_on_cluster(work, items, dask):
+        if isinstance(found, _Reported):
+            for line in found.lines:
+                tell(line)
+            found = cast("Found", found.found)  # noqa: PLW2901
         if label:
             advance(label, 1)
         yield found

@@ -359,10 +359,10 @@ def _check_candidates(poses: Sequence[Pose], candidates: Sequence[Pose]) -> None
         given.add(at)
 
 
-def candidates_at(pose: Pose, candidates: Sequence[Pose]) -> list[int]:
-    """Return the candidates within 5 cm of a pose, the nearest first; heading and scale may have been refined."""
+def candidates_at(pose: Pose, candidates: Sequence[Pose], within_m: float = SAME_PLACE_M) -> list[int]:
+    """Return the candidates at a pose, the nearest first; heading and scale may have been refined."""
     gaps_m = [math.hypot(pose.easting_m - item.easting_m, pose.northing_m - item.northing_m) for item in candidates]
-    near = [index for index, gap_m in enumerate(gaps_m) if gap_m <= SAME_PLACE_M]
+    near = [index for index, gap_m in enumerate(gaps_m) if gap_m <= within_m]
     return sorted(near, key=gaps_m.__getitem__)
 
 

@@ -35,7 +35,7 @@ from sasgeo_bench.core.texts import (
 )
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.cards import Names, Record, TrainingRecord
-from sasgeo_bench.matching.matcher import STATUSES, Prediction
+from sasgeo_bench.matching.matcher import SAME_PLACE_M, STATUSES, Prediction
 from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE, are_covariances
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.tasks.task_files import ASKED, POSE_FIELDS, asked_under, is_like, poses_of, tie_key
@@ -196,6 +196,7 @@ ROUND: Final = "round.json"  # beside the tasks of a run, while all of it is ask
 STEP_M: Final = 2.0**-7
 STEP_DEG: Final = 2.0**-7
 COVARIANCE_BITS: Final = 16
+CANDIDATE_M: Final = SAME_PLACE_M + STEP_M  # of a candidate, as far as an answer that names it may be read
 
 _MEND: Final = "write it again, or remove it where it is a part of a run"
 _MEND_ROUND: Final = "remove it and enter with --again"
@@ -391,7 +392,9 @@ def rounded(answers: pa.Table) -> pa.Table:
     starts = pc.subtract(listed.offsets, listed.offsets[0]).cast(pa.int32())
     new = {"candidates": pa.ListArray.from_arrays(starts, struct)}
     if "covariance" in answers.column_names:
-        new["covariance"] = _rounded_covariances(answers["covariance"].combine_chunks())
+        # a file may lack all of them, and so their type
+        whole = answers["covariance"].cast(pa.list_(pa.float64())).combine_chunks()
+        new["covariance"] = _rounded_covariances(whole)
     for name, column in new.items():
         answers = answers.set_column(answers.column_names.index(name), name, column)
     return answers

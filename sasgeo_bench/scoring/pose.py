@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.matching.matcher import Prediction, candidates_at
+from sasgeo_bench.running.prediction_files import CANDIDATE_M
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column
 from sasgeo_bench.tasks.query import Truth
 
@@ -68,7 +69,7 @@ def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequ
     right = []
     for pose, _ in prediction.candidates:
         # As in `matcher.check_match`: of two candidates at one position, the first one not used yet.
-        at = next((index for index in candidates_at(pose, candidates) if index not in given), -1)
+        at = next((index for index in candidates_at(pose, candidates, CANDIDATE_M) if index not in given), -1)
         given.add(at)
         right.append(at == truth.candidate)
     return rank_of([score for _, score in prediction.candidates], right)

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.core.errors import MetricError
-from sasgeo_bench.matching.matcher import SAME_PLACE_M, Prediction
-from sasgeo_bench.running.prediction_files import AnswerColumns, Answers
+from sasgeo_bench.matching.matcher import Prediction
+from sasgeo_bench.running.prediction_files import CANDIDATE_M, AnswerColumns, Answers
 from sasgeo_bench.scoring.base import Bools, Floats, Ints
 from sasgeo_bench.scoring.frames import PRIOR_GROUP, TRACK, Shown, row_columns
 from sasgeo_bench.scoring.pose import check_candidate, columns_of, pose_errors, rank_candidate, ranks_of_lists
@@ -159,7 +159,7 @@ class Questions:
                 spots_m = np.array([(pose.easting_m, pose.northing_m) for pose in head.candidates])
                 check_candidate(truth, len(spots_m))
                 right_m[at] = spots_m[truth.candidate]
-                if np.count_nonzero(distances_m(spots_m, right_m[at]) <= 2 * SAME_PLACE_M) > 1:
+                if np.count_nonzero(distances_m(spots_m, right_m[at]) <= 2 * CANDIDATE_M) > 1:
                     twins.add(at)
         return cls(
             heads=asked,
@@ -218,7 +218,7 @@ class Questions:
         query = np.full(len(answers.query_id), -1)
         query[row_of[row_of >= 0]] = np.flatnonzero(row_of >= 0)
         spots_m = self.right_m[query[answers.row]]
-        is_right = answers.is_ok[answers.row] & (distances_m(answers.poses[:, :2], spots_m) <= SAME_PLACE_M)
+        is_right = answers.is_ok[answers.row] & (distances_m(answers.poses[:, :2], spots_m) <= CANDIDATE_M)
         found = ranks_of_lists(answers.row, answers.scores, is_right, len(answers.query_id))
         ranks = np.array([np.append(column, 0)[row_of] for column in (found.above, found.tied, found.right)])
         for at in self.twins:

@@ -804,8 +804,9 @@ def rewrite(path, column, value):
 @pytest.fixture
 def both(out, tmp_path):
     """A good file beside a bad one; a contrast of the two."""
-    for name in ("good", "bad"):
-        submission(out, tmp_path / f"{name}.parquet", change=lambda row, _: replace(row, diagnostics={"told": 1.0}))
+    for name, told in (("good", 1.0), ("bad", 2.0)):
+        told_of = {"told": told}
+        submission(out, tmp_path / f"{name}.parquet", change=lambda row, _, of=told_of: replace(row, diagnostics=of))
     return [tmp_path / "good.parquet", tmp_path / "bad.parquet"]
 
 
@@ -889,7 +890,7 @@ def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out,
 
 def fails_with(monkeypatch, name, is_bad):
     """A mistake of ours that only what one contestant says brings about."""
-    room = {"_scored": entries, "hold_controls": entries, "leaderboard": tables}.get(name, boards)
+    room = {"scored": entries._Asked, "hold_controls": entries, "leaderboard": tables}.get(name, boards)
     work = getattr(room, name)
 
     def broken(*words, **more):
@@ -903,7 +904,7 @@ def fails_with(monkeypatch, name, is_bad):
 @pytest.mark.parametrize(
     ("step", "is_bad"),
     [
-        ("_scored", lambda told, *_: told.entry.name == "bad"),
+        ("scored", lambda _, answers: any(row.diagnostics["told"] == 2.0 for row in answers.found.values())),
         ("hold_controls", lambda scored: "bad" in scored),
         ("leaderboard", lambda scores, **_: "bad" in scores),
     ],
@@ -982,7 +983,7 @@ def test_a_disk_that_is_full_stops_everything(out, both, monkeypatch):
     def full(*_, **__):
         raise StoreError("cannot be written") from OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(entries, "_scored", full)
+    monkeypatch.setattr(entries._Asked, "scored", full)
     with pytest.raises(StoreError, match="cannot be written"):
         board_of(out, *both)
     assert not (out / "boards" / "mine").exists()

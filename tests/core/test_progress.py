@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from sasgeo_bench.core.errors import ConfigError, StoreError
-from sasgeo_bench.core.progress import spread
+from sasgeo_bench.core.progress import reported, reporting, spread, tell
 
 PROGRAM = """
 from pathlib import Path
@@ -30,6 +30,11 @@ def note_and_wait(path: Path) -> None:
     path.with_suffix(".part").write_text(str(os.getpid()), encoding="ascii")
     path.with_suffix(".part").replace(path)
     time.sleep(LONG_S)
+
+
+def told(name):
+    tell(f"{name} told")
+    return name.upper()
 
 
 def die(number):
@@ -86,3 +91,12 @@ def test_a_killed_program_leaves_no_process_behind(tmp_path):
     program.wait()
     _, alive = psutil.wait_procs(left, timeout=LONG_S / 2)
     assert alive == []
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("is_bound", [True, False])
+def test_lines_of_other_processes_reach_whoever_listens_here(jobs, is_bound):
+    lines = []
+    with reporting(lines.append if is_bound else lambda line: lines.append(line)):  # noqa: PLW0108 - no bound method
+        assert list(spread(reported(told), ["a", "b", "c"], jobs=jobs)) == ["A", "B", "C"]
+    assert lines == ["a told", "b told", "c told"]

@@ -309,3 +309,9 @@ def test_a_covariance_that_would_be_none_when_it_is_rounded_is_kept():
     narrow = np.array([[1.0, 1 - 1e-9, 0.0], [1 - 1e-9, 1.0, 0.0], [0.0, 0.0, 1 / 3]])
     item = Prediction(query_id="a", candidates=(), is_accepted=False, covariance=tuple(narrow.ravel().tolist()))
     assert Answers.of([item]).found["a"].covariance == item.covariance
+
+
+def test_a_column_of_nulls_without_a_type_is_read(rows, write):
+    nothing = pa.nulls(len(rows))
+    path = write(rows.append_column("is_accepted", nothing).append_column("covariance", nothing))
+    assert Answers.read(path).found["b"] == Answers.of([FULL]).found["b"]

@@ -3,6 +3,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from sklearn.metrics import label_ranking_average_precision_score, top_k_accurac
 
 from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.matcher import Prediction
+from sasgeo_bench.matching.matcher import Prediction, candidates_at
+from sasgeo_bench.running.prediction_files import Answers
 from sasgeo_bench.scoring.base import weighted_mean
 from sasgeo_bench.scoring.pose import (
     MISS,
@@ -138,6 +140,19 @@ CANDIDATES = [pose(1000.0 * at) for at in range(5)]
 
 def answer(*given: tuple[int, float], **more: object) -> Prediction:
     return Prediction(query_id="q", candidates=tuple((CANDIDATES[at], score) for at, score in given), **more)
+
+
+@given(st.floats(0, 2 * math.pi), st.floats(0, 0.0499), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
+def test_an_answer_that_is_taken_for_a_candidate_is_one_when_it_is_read(angle, gap_m, east_m, north_m):
+    one = replace(CANDIDATES[3], easting_m=CANDIDATES[3].easting_m + east_m, northing_m=north_m)
+    near = replace(
+        one,
+        easting_m=one.easting_m + gap_m * math.cos(angle),
+        northing_m=one.northing_m + gap_m * math.sin(angle),
+    )
+    read = Answers.of([Prediction(query_id="q", candidates=((near, 1.0),))]).found["q"]
+    assert candidates_at(near, [one]) == [0]
+    assert rank_candidate(read, truth_of(candidate=0), [one]).right == 1
 
 
 def test_the_right_candidate_is_found_by_its_place(truth_of) -> None:

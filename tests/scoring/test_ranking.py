@@ -3,7 +3,6 @@
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,17 +141,18 @@ def answer(*given: tuple[int, float], **more: object) -> Prediction:
     return Prediction(query_id="q", candidates=tuple((CANDIDATES[at], score) for at, score in given), **more)
 
 
-@given(st.floats(0, 2 * math.pi), st.floats(0, 0.0499), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
-def test_an_answer_that_is_taken_for_a_candidate_is_one_when_it_is_read(angle, gap_m, east_m, north_m):
-    one = replace(CANDIDATES[3], easting_m=CANDIDATES[3].easting_m + east_m, northing_m=north_m)
-    near = replace(
-        one,
-        easting_m=one.easting_m + gap_m * math.cos(angle),
-        northing_m=one.northing_m + gap_m * math.sin(angle),
-    )
-    read = Answers.of([Prediction(query_id="q", candidates=((near, 1.0),))]).found["q"]
-    assert candidates_at(near, [one]) == [0]
-    assert rank_candidate(read, truth_of(candidate=0), [one]).right == 1
+def test_an_answer_that_is_taken_for_a_candidate_is_one_when_it_is_read(truth_of) -> None:
+    rng = np.random.default_rng(0)
+    for angle, gap_m, (east_m, north_m) in zip(
+        rng.uniform(0, 2 * math.pi, 200), rng.uniform(0.04, 0.05, 200), rng.uniform(0, 1000, (200, 2)), strict=True
+    ):
+        one = Pose(easting_m=east_m, northing_m=north_m, yaw_deg=0.0)
+        near = Pose(
+            easting_m=east_m + gap_m * math.cos(angle), northing_m=north_m + gap_m * math.sin(angle), yaw_deg=0.0
+        )
+        read = Answers.of([Prediction(query_id="q", candidates=((near, 1.0),))]).found["q"]
+        assert candidates_at(near, [one]) == [0]
+        assert rank_candidate(read, truth_of(candidate=0), [one]).right == 1
 
 
 def test_the_right_candidate_is_found_by_its_place(truth_of) -> None:

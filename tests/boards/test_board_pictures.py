@@ -279,7 +279,7 @@ def test_inspect_counts_the_failures_of_a_run_and_draws_any_of_its_queries(root,
     code, text, err = program("inspect", run)
     assert code == 0, err
     assert "absent accepted" in text
-    assert re.search(r"failures in \d+ queries, \d+ of them under stress", text)
+    assert re.search(r"failures in \d+ queries, \d+ of the queries under stress", text)
     assert not (tmp_path / "out").exists()
     query = task_files.Task.open(root / "tasks" / "alias" / "town-grid+alias").ids()[2]
     code, text, err = program("inspect", run, "--query", query[:10], "--out", tmp_path / "mine")

@@ -358,7 +358,7 @@ def find_plugin(spec: str, group: str) -> Any:  # noqa: ANN401 - any plugin
         raise _failed(one_line(spec), "cannot be imported", error) from error
 
 
-NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")  # of what runs inside the program
+NAME: Final = re.compile(r"(?!.{61})[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")  # of what runs inside the program
 
 
 def find_inside(spec: str, group: str, *, shipped: Collection[str]) -> Any:  # noqa: ANN401 - any plugin
@@ -379,7 +379,10 @@ def check_own_name(spec: str, name: object, group: str, *, shipped: Collection[s
     `where` is what says the name.
     """
     if not isinstance(name, str) or not NAME.fullmatch(name):
-        raise MatchError(f"{spec}: {where} is named {name!r}: lower-case letters, digits, - and _ make a name")
+        said = one_line(repr(name))
+        raise MatchError(
+            f"{spec}: {where} is named {said}: lower-case letters, digits, - and _ make a name, 60 at most"
+        )
     if name in shipped:
         raise MatchError(f"{spec}: {where} is named {name!r}, as a {KINDS[group]} that ships: rename it")
     if ":" not in spec and name != spec:

@@ -195,6 +195,16 @@ def one_line(text: str) -> str:
     return line if len(line) <= MOST_MESSAGE else line[: MOST_MESSAGE - 3] + "..."
 
 
+def typed(value: object) -> str:
+    """Return the name of the type of a value with its article.
+
+    >>> typed(3), typed("3")
+    ('an int', 'a str')
+    """
+    name = one_line(type(value).__name__)
+    return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
+
+
 def message_of(error: BaseException) -> str:
     """Return class and text of an error in one line; only the class if its text cannot be made.
 

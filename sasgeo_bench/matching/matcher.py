@@ -4,9 +4,10 @@
 import hashlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from dataclasses import asdict, dataclass, field
 from itertools import islice
+from numbers import Real
 from typing import Final, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
@@ -24,6 +25,7 @@ from sasgeo_bench.core.texts import (
     bounds_text,
     is_line,
     one_line,
+    typed,
 )
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.region import Region
@@ -303,10 +305,12 @@ def check_match(match: object, query: Query | Head | None, *, top_k: int) -> Mat
     """
     if not isinstance(match, Match):
         raise MatchError(f"match() returned {type(match).__name__}, expected sasgeo_bench.matching.matcher.Match")
-    count = len(match.poses)
+    count = _count(match.poses)
     if count > min(top_k, MOST_CANDIDATES):
         raise MatchError(f"match() returned {count} poses, expected at most top_k = {min(top_k, MOST_CANDIDATES)}")
     # An object of some length may still yield more or fewer items.
+    if not isinstance(match.scores, Iterable):
+        raise MatchError(f"scores is {typed(match.scores)}, expected a sequence of as many numbers as poses")
     scores = [_number(score, "score") for score in islice(match.scores, MOST_CANDIDATES + 1)]
     poses = [_pose(pose) for pose in islice(match.poses, count)]
     if len(poses) != count or len(scores) != count:
@@ -323,13 +327,21 @@ def check_match(match: object, query: Query | Head | None, *, top_k: int) -> Mat
     return Match(poses=poses, scores=scores, confidence=confidence, diagnostics=diagnostics)
 
 
+def _count(poses: object) -> int:
+    if not isinstance(poses, Iterable) or not isinstance(poses, Sized):
+        raise MatchError(f"poses is {typed(poses)}, expected a sequence, which is empty if the answer is withheld")
+    return len(poses)
+
+
 def _number(value: object, name: str, *, shown: str = "") -> float:
     try:
         if isinstance(value, str | bytes):
             raise TypeError(value)  # noqa: TRY301 - Python reads "0.5" as a number, the door does not
         number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError) as error:
-        raise MatchError(f"{shown or name} is a {type(value).__name__}, expected a number") from error
+    except OverflowError as error:
+        raise MatchError(f"{shown or name} is too large, expected a number within {bounds_text(name)}") from error
+    except (TypeError, ValueError) as error:
+        raise MatchError(f"{shown or name} is {typed(value)}, expected a number") from error
     least, most = BOUNDS[name]
     if not least <= number <= most:
         raise MatchError(f"{shown or name} is {number:g}, expected a finite number within {bounds_text(name)}")
@@ -338,7 +350,7 @@ def _number(value: object, name: str, *, shown: str = "") -> float:
 
 def _pose(pose: object) -> Pose:
     if not isinstance(pose, Pose):
-        raise MatchError(f"a pose is a {type(pose).__name__}, expected sasgeo_bench.geometry.pose.Pose")
+        raise MatchError(f"a pose is {typed(pose)}, expected sasgeo_bench.geometry.pose.Pose")
     numbers = {name: _number(getattr(pose, name), name) for name in ("easting_m", "northing_m", "yaw_deg", "scale")}
     return Pose(**numbers)
 
@@ -368,7 +380,7 @@ def candidates_at(pose: Pose, candidates: Sequence[Pose], within_m: float = SAME
 
 def _diagnostics(given: object) -> dict[str, float]:
     if not isinstance(given, Mapping):
-        raise MatchError(f"diagnostics is a {type(given).__name__}, expected a mapping of name to number")
+        raise MatchError(f"diagnostics is {typed(given)}, expected a mapping of name to number")
     if len(given) > MOST_DIAGNOSTICS:
         raise MatchError(f"diagnostics holds {len(given)} entries, expected at most {MOST_DIAGNOSTICS}")
     pairs = [(str(name), value) for name, value in islice(given.items(), MOST_DIAGNOSTICS + 1)]
@@ -455,6 +467,23 @@ def remark_of(rejector: Rejector) -> str:
     return one_line(str(getattr(rejector, "remark", "") or ""))
 
 
+def numbers_of(given: object) -> NDArray[np.float64]:
+    """Return numbers as an array of floats; raise TypeError, ValueError or OverflowError where they are none.
+
+    Texts, complex numbers and masks are none: NumPy would convert the first two, and lose part of the others.
+
+    >>> numbers_of([[1, True], [0.5, 2]]).tolist()
+    [[1.0, 1.0], [0.5, 2.0]]
+    """
+    found = np.asanyarray(given)
+    if isinstance(found, np.ma.MaskedArray):
+        raise TypeError("the mask of a masked array would be lost")
+    is_mixed = found.dtype.kind == "O" and all(isinstance(one, Real | np.bool_) for one in found.flat)
+    if found.dtype.kind not in "biuf" and not is_mixed:
+        raise TypeError("they are no numbers")
+    return np.asarray(found, dtype=np.float64)
+
+
 def check_p_false(found: object, count: int) -> NDArray[np.float64]:
     """Return the result of `p_false` as float64, shape (count,); raise `MatchError` if it is not `count` numbers, 0..1.
 
@@ -462,8 +491,8 @@ def check_p_false(found: object, count: int) -> NDArray[np.float64]:
     array([0.25, 1.  ])
     """
     try:
-        values = np.asarray(found, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        values = numbers_of(found)
+    except (TypeError, ValueError, OverflowError) as error:
         raise MatchError(f"p_false() returned {type(found).__name__}, expected {count} numbers") from error
     if values.shape != (count,):
         raise MatchError(f"p_false() returned shape {values.shape}, expected ({count},): one number for each answer")

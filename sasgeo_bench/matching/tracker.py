@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from sasgeo_bench.core.errors import MatchError
+from sasgeo_bench.core.texts import message_of, typed
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.matcher import Match, MatcherCard, Prediction, check_match
+from sasgeo_bench.matching.matcher import Match, MatcherCard, Prediction, check_match, numbers_of
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import Head, Query
 
@@ -86,7 +87,7 @@ def check_fix(fix: object, *, top_k: int) -> Fix:
         given = "nothing" if fix is None else type(fix).__name__
         raise MatchError(f"step() returned {given}, expected a sasgeo_bench.Fix: without a pose where nothing is known")
     if not isinstance(fix.is_accepted, bool | np.bool_):
-        raise MatchError(f"is_accepted is a {type(fix.is_accepted).__name__}, expected True or False")
+        raise MatchError(f"is_accepted is {typed(fix.is_accepted)}, expected True or False")
     if fix.pose is None and (fix.is_accepted or fix.modes):
         raise MatchError("a fix without a pose is not accepted and has no modes: say is_accepted=False")
     found = check_match(match_of(fix), None, top_k=top_k)
@@ -162,10 +163,10 @@ def are_covariances(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
 def check_covariance(given: object) -> NDArray[np.float64]:
     """Return a covariance, 3 x 3 or row by row, as an array of shape (3, 3); raise `MatchError` if it is none."""
     try:
-        found = np.array(given, dtype=np.float64)
+        found = numbers_of(given)
         found = found.reshape(SIDE, SIDE) if found.shape == (SIDE**2,) else found
-    except (TypeError, ValueError) as error:
-        raise MatchError(f"covariance is a {type(given).__name__}, expected 3 x 3 numbers") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise MatchError(f"covariance is {typed(given)}, expected 3 x 3 numbers ({message_of(error)})") from error
     if found.shape != (SIDE, SIDE):
         raise MatchError(f"covariance has shape {found.shape}, expected {SIDE} x {SIDE}: east, north, yaw")
     if not (np.abs(found) <= MOST_VARIANCE).all():

@@ -2,7 +2,7 @@
 """Metrics of other packages: found by name or module:NAME, and measured on scored rows."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from numbers import Real
@@ -10,12 +10,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import MatchError, MetricError
 from sasgeo_bench.core.plugins import METRICS as GROUP
 from sasgeo_bench.core.plugins import check_own_name, code_of, find_inside, list_entry_points, plugin_code
 from sasgeo_bench.core.progress import tell
-from sasgeo_bench.core.texts import message_of
+from sasgeo_bench.core.texts import is_line, message_of, one_line, typed
+from sasgeo_bench.matching.matcher import MOST_SAID, numbers_of
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.metric import MeanMetric, Metric
 from sasgeo_bench.scoring.metrics import METRICS, TRACKS
@@ -84,8 +86,13 @@ def _foreign(spec: str) -> MeanMetric:
         what = "a function" if is_function else f"an object of type {type(found).__name__}"
         mend = f": name MeanMetric(name=..., values={spec.partition(':')[2]}, ...)" if is_function else ""
         raise MatchError(f"{spec}: {what} is no metric, which is an instance of sasgeo_bench.MeanMetric{mend}")
-    check_own_name(spec, found.name, GROUP, shipped=SHIPPED)
-    fault = _silence(found)
+    try:
+        check_own_name(spec, found.name, GROUP, shipped=SHIPPED)
+        fault = _silence(found)
+    except MatchError:
+        raise
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - of whatever its fields hold
+        fault = f"what it says of itself cannot be read ({message_of(error)})"
     if fault:
         raise MatchError(f"{spec}: {fault}")
     return found
@@ -94,16 +101,17 @@ def _foreign(spec: str) -> MeanMetric:
 def _silence(metric: MeanMetric) -> str | None:
     """Return what a metric should say of itself, and does not; None if it says all."""
     blank = next((name for name in ("meaning", "unit", "source") if not _is_line(getattr(metric, name))), None)
-    bounds = metric.bounds if isinstance(metric.bounds, tuple | list) else ()
-    are_bounds = len(bounds) == 2 and all(isinstance(end, Real) for end in bounds) and bounds[0] < bounds[1]
+    is_better = isinstance(metric.better, str) and metric.better in ("higher", "lower")
     tracks = metric.tracks if isinstance(metric.tracks, tuple | list) else ()
-    are_tracks = bool(tracks) and all(track in TRACKS for track in tracks)
+    are_tracks = bool(tracks) and all(isinstance(track, str) and track in TRACKS for track in tracks)
     faults = {
         f"it is named {metric.name!r}, as a column of boards: rename it": metric.name in COLUMNS,
-        f"its {blank} is {getattr(metric, str(blank), '')!r}, expected a line of text": blank is not None,
-        f"better is {metric.better!r}, expected 'higher' or 'lower'": metric.better not in ("higher", "lower"),
-        f"bounds are {metric.bounds!r}, expected the least and the greatest value, as in (0.0, 1.0)": not are_bounds,
-        f"tracks are {metric.tracks!r}, expected some of {TRACKS}": not are_tracks,
+        f"its {blank} is {_shown(getattr(metric, str(blank), ''))}, expected a line of text, {MOST_SAID} characters "
+        "at most": blank is not None,
+        f"better is {_shown(metric.better)}, expected 'higher' or 'lower'": not is_better,
+        f"bounds are {_shown(metric.bounds)}, expected the least and the greatest value, as in "
+        "(0.0, 1.0)": not _are_bounds(metric.bounds),
+        f"tracks are {_shown(metric.tracks)}, expected some of {TRACKS}": not are_tracks,
         "is_primary is true, and boards rank by metrics that ship alone: leave it out": metric.is_primary,
         "values is no function of scored rows": not callable(metric.values),
         "counts is no function of scored rows": not callable(metric.counts),
@@ -111,8 +119,21 @@ def _silence(metric: MeanMetric) -> str | None:
     return next((fault for fault, is_there in faults.items() if is_there), None)
 
 
+def _shown(value: object) -> str:
+    return one_line(repr(value))
+
+
 def _is_line(value: object) -> bool:
-    return isinstance(value, str) and bool(value.strip()) and value.isprintable()
+    return isinstance(value, str) and bool(value.strip()) and is_line(value, MOST_SAID)
+
+
+def _are_bounds(given: object) -> bool:
+    if not isinstance(given, tuple | list) or len(given) != 2 or not all(isinstance(end, Real) for end in given):
+        return False
+    try:
+        return float(given[0]) < float(given[1])
+    except OverflowError:  # of a whole number beyond all floats
+        return False
 
 
 def values_of(metric: MeanMetric, scores: pd.DataFrame) -> Floats:
@@ -121,21 +142,12 @@ def values_of(metric: MeanMetric, scores: pd.DataFrame) -> Floats:
     It is given a copy. Raise `MetricError` if it fails, or a value is no number, or out of bounds.
     """
     rows = scores.reset_index(drop=True)
-    try:
-        given = metric.values(rows.copy())
-        counts = np.asarray(metric.counts(rows.copy()))
-    except (Exception, SystemExit) as error:  # whatever code of somebody's own raises
-        raise MetricError(f"it fails ({message_of(error)})") from error
-    if isinstance(given, pd.Series) and not given.index.equals(rows.index):
-        raise MetricError("its values are of other rows, or in another order, than the scores")
-    values = _numbers(given)
-    for what, column in (("values have", values), ("counts have", counts)):
-        if column.shape != (len(rows),):
-            raise MetricError(f"its {what} shape {column.shape}, expected ({len(rows)},): one for each row of scores")
+    said = _asked(metric.values, rows, "values")
+    counts = _asked(metric.counts, rows, "counts")
     if counts.dtype != bool:
         raise MetricError(f"its counts are of type {counts.dtype}, expected bool")
-    values = np.where(counts, values, np.nan)
-    low, high = metric.bounds
+    values = np.where(counts, said.astype(float), np.nan)
+    low, high = map(float, metric.bounds)
     wrong = np.isinf(values) | (values < low - _SLACK) | (values > high + _SLACK)
     if wrong.any():
         raise MetricError(
@@ -145,20 +157,28 @@ def values_of(metric: MeanMetric, scores: pd.DataFrame) -> Floats:
     return np.clip(values, low, high)
 
 
-def _numbers(given: object) -> Floats:
-    """Return what a function returned as floats; bools count as 0 and 1."""
-    values = np.asarray(given)
-    if (
-        values.dtype.kind == "O"
-        and values.ndim == 1
-        and all(isinstance(one, Real | np.bool_) or one is pd.NA for one in values)
-    ):
-        values = np.array([math.nan if one is pd.NA else one for one in values], dtype=float)
-    if values.dtype.kind not in "biuf":
+def _asked(function: Callable[[pd.DataFrame], object], rows: pd.DataFrame, what: str) -> NDArray[np.generic]:
+    """Return what a function of somebody's own says of each row of a copy: bools, or numbers."""
+    try:
+        given = function(rows.copy())
+    except (Exception, SystemExit) as error:  # whatever code of somebody's own raises
+        raise MetricError(f"it fails ({message_of(error)})") from error
+    try:
+        in_order = not isinstance(given, pd.Series) or given.index.equals(rows.index)
+        found = np.asanyarray(given)
+        if found.dtype.kind == "O" and found.ndim == 1:
+            found = np.array([math.nan if one is pd.NA else one for one in found], dtype=object)
+        numbers = numbers_of(found)
+    except (Exception, SystemExit) as error:  # of a list of lists, or of an object that says it is an array
         raise MetricError(
-            f"it returns a {type(given).__name__} of no numbers, expected a number for each row of scores"
-        )
-    return np.asarray(values, dtype=float)
+            f"it returns {typed(given)} of no numbers as its {what}, expected one for each row of scores "
+            f"({message_of(error)})"
+        ) from error
+    if not in_order:
+        raise MetricError(f"its {what} are of other rows, or in another order, than the scores")
+    if numbers.shape != (len(rows),):
+        raise MetricError(f"its {what} have shape {numbers.shape}, expected ({len(rows)},): one for each row of scores")
+    return numbers if found.dtype.kind == "O" else np.asarray(found)
 
 
 def measured(

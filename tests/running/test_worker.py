@@ -68,7 +68,7 @@ def test_whatever_a_matcher_does_to_its_process_becomes_a_status_and_a_line(plac
         ("RaisesInPrepare", "crash", "ValueError: no index today"),
         ("ScoresNan", "invalid", "score is nan, expected a finite number"),
         ("SureByWords", "invalid", "confidence is a str, expected a number"),
-        ("SureBeyondNumbers", "invalid", "confidence is a int, expected a number"),
+        ("SureBeyondNumbers", "invalid", "confidence is too large, expected a number within 0..1"),
         ("ReturnsText", "invalid", "match.. returned str, expected"),
         ("ReturnsMany", "invalid", "returned 1000000 poses, expected at most top_k = 5"),
         ("FarAway", "invalid", "an answer that is none: easting_m is 1e.300, expected a finite number within"),

@@ -34,6 +34,24 @@ def foreign(*metrics):
     return [ForeignMetric(f"mine:{at}", one, "0" * 64) for at, one in enumerate(metrics)]
 
 
+class Untold:
+    def __repr__(self):
+        return "Untold()"
+
+
+class Unsaid:
+    def __repr__(self):
+        raise SystemExit(0)
+
+
+class Unarrayed:
+    def __init__(self, error):
+        self.error = error
+
+    def __array__(self, *_, **__):
+        raise self.error
+
+
 @pytest.fixture
 def named(monkeypatch):
     """Put something into a module, and return how it is named."""
@@ -58,6 +76,16 @@ def named(monkeypatch):
         (metric(name="rank"), "it is named 'rank', as a column of boards: rename it"),
         (metric(name="Near One"), "it is named 'Near One': lower-case letters"),
         (metric(name=3), "it is named 3: lower-case letters"),
+        (metric(name="n" * 5000), "it is named 'nnn"),
+        (metric(meaning="m" * 4001), "its meaning is 'mmm"),
+        (
+            metric(meaning="two\nlines"),
+            "its meaning is 'two\\nlines', expected a line of text, 4000 characters at most",
+        ),
+        (metric(better=np.array(["higher", "lower"])), "better is array(['higher', 'lower']"),
+        (metric(bounds=(0, 10**400)), "bounds are (0, 1000"),
+        (metric(bounds=(0, Untold())), "bounds are (0, Untold()), expected"),
+        (metric(meaning=Unsaid()), "what it says of itself cannot be read (SystemExit"),
         (metric(meaning=" "), "its meaning is ' ', expected a line of text"),
         (metric(unit="a\nb"), "its unit is 'a\\nb', expected a line of text"),
         (metric(better="more"), "better is 'more', expected 'higher' or 'lower'"),
@@ -77,6 +105,7 @@ def test_what_is_no_metric_or_says_nothing_of_itself_is_refused_in_one_line(name
         find_metric(named(value))
     assert str(refused.value).startswith(f"metrics_of_mine:ONE: {fault}")
     assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 500
 
 
 @pytest.mark.parametrize(
@@ -133,6 +162,15 @@ def stop(_):
         (lambda rows: np.full(len(rows), 1.5), "it says 1.5, expected a finite number between 0 and 1"),
         (lambda rows: np.full(len(rows), -0.1), "it says -0.1, expected a finite number between 0 and 1"),
         (lambda rows: pd.Series(near(rows))[::-1], "its values are of other rows, or in another order"),
+        (
+            lambda rows: np.ma.masked_array(near(rows), near(rows) > 0),
+            "it returns a MaskedArray of no numbers as",
+        ),
+        (lambda rows: [[1.0]] + [[1.0, 2.0]] * (len(rows) - 1), "it returns a list of no numbers as its values"),
+        (lambda rows: [10**400] * len(rows), "it returns a list of no numbers as its values"),
+        (lambda _: Unarrayed(RuntimeError("two\nlines")), "it returns an Unarrayed of no numbers as its values"),
+        (lambda _: Unarrayed(SystemExit(0)), "it returns an Unarrayed of no numbers as its values"),
+        (lambda rows: near(rows) * 1j, "it returns a ndarray of no numbers"),
     ],
 )
 def test_a_metric_that_fails_on_answers_is_named_in_one_line_and_nothing_is_compared(values, fault):
@@ -142,9 +180,20 @@ def test_a_metric_that_fails_on_answers_is_named_in_one_line_and_nothing_is_comp
     assert "\n" not in str(raised.value)
 
 
-def test_a_mask_of_no_bools_is_refused():
-    with pytest.raises(MetricError, match="its counts are of type float64, expected bool"):
-        measured(foreign(metric(counts=lambda rows: np.ones(len(rows)))), {"mine": scores([0.0])})
+@pytest.mark.parametrize(
+    ("counts", "fault"),
+    [
+        (lambda rows: np.ones(len(rows)), "its counts are of type float64, expected bool"),
+        (lambda rows: [1] * len(rows), "its counts are of type int64, expected bool"),
+        (lambda rows: (rows["position_error_m"] < 9.0)[::-1], "its counts are of other rows, or in another order"),
+        (lambda rows: np.ma.masked_array([True] * len(rows), mask=True), "it returns a MaskedArray of no numbers as"),
+        (lambda rows: [True] * (len(rows) - 1), r"its counts have shape \(1,\), expected \(2,\)"),
+        (lambda _: Unarrayed(SystemExit(0)), "it returns an Unarrayed of no numbers as its counts"),
+    ],
+)
+def test_a_mask_of_no_bools_or_of_other_rows_is_refused(counts, fault):
+    with pytest.raises(MetricError, match=f"^mine:0, on the answers of mine .localization.: {fault}"):
+        measured(foreign(metric(counts=counts)), {"mine": scores([0.0, 99.0])})
 
 
 def test_what_counts_may_not_depend_on_the_answer():
@@ -210,6 +259,7 @@ def ranks(rows):
         ("no answer is the worst there is", metric(lambda rows: np.where(rows["is_answered"], near(rows), 0.5))),
         ("no answer is the worst there is", metric(lambda rows: rows["is_answered"] * 1.0, better="lower")),
         ("a number, or NaN, for each query", metric(lambda rows: rows["position_error_m"])),
+        ("a number, or NaN, for each query", metric(lambda rows: np.full(len(rows), np.nan))),
     ],
 )  # fmt: skip
 def test_a_metric_that_breaks_a_rule_fails_there(named, tmp_path, rule, one):

@@ -31,7 +31,7 @@ from sasgeo_bench.boards.board_tables import (
     summary,
 )
 from sasgeo_bench.boards.manifests import BoardEntry, BoardManifest, MetricRecord
-from sasgeo_bench.boards.tables import DAGGER, NOTE, RANKS_NOTE, TERMS, Table, text_of
+from sasgeo_bench.boards.tables import DAGGER, MEANINGS, NOTE, RANKS_NOTE, TERMS, Table, text_of
 from sasgeo_bench.core.errors import counted, named
 from sasgeo_bench.core.texts import markdown, markdown_item, tex
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
@@ -320,6 +320,8 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
         *(f"Failed, and not on this board: {name}: {why}" for name, why in about.failed.items()),
     ]
     columns = {column.term: column.meaning for table in tables for column in table.columns}
+    ours = set(MEANINGS.values())  # which may hold code
+    escaped = {term: said if said in ours else markdown(said) for term, said in columns.items()}
     return "\n".join(
         (
             f"# Board: scorer version {about.scorer_version}, task version {about.task_version}",
@@ -333,7 +335,7 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
             *(line for table in tables for line in table_markdown(table)),
             "## How to read",
             "",
-            *(f"- **{markdown(term)}**: {meaning}." for term, meaning in (columns | TERMS).items()),
+            *(f"- **{markdown(term)}**: {meaning}." for term, meaning in (escaped | TERMS).items()),
             "",
         )
     )

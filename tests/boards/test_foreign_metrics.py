@@ -54,7 +54,7 @@ def written(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("plain_site")
 def test_it_has_rows_a_column_and_a_name_and_the_board_lives_without_it(answered, tmp_path, written):
-    written()
+    written("Nearness of", "Nearness <b> *of")
     plain, _ = world.scored(answered, "plain")
     scored, request = world.scored(answered, "more", metrics=[SPEC])
     board = sgb.read_board(answered / "boards" / "more")
@@ -76,6 +76,7 @@ def test_it_has_rows_a_column_and_a_name_and_the_board_lives_without_it(answered
     head = next(line for line in text.partition(f"## {CLEAN}")[2].splitlines() if line.startswith("| matcher"))
     assert "| within_25m | nearness |" in head
     assert text.count(whose) == 2  # above, and where columns are told
+    assert text.count(r"Nearness &lt;b> \*of") == 2
 
     (tmp_path / "nearness_of_mine.py").unlink()  # as on a machine without it
     sys.modules.pop("nearness_of_mine")

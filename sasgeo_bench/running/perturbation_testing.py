@@ -85,7 +85,8 @@ class _Kit:
         moves = getattr(self.perturbation, "moves_cells", False)
         kept = "cells move, and nothing appears" if moves else "unknown cells stay unknown"
         found = f"{len(self.views)} views"
-        yield from tried(
+        told: dict[str, str] = {}
+        for row in tried(
             (
                 ("gives a view of the same classes and shape", self.keeps_shape, found),
                 ("changes no cell at strength 0", self.is_neutral, found),
@@ -97,7 +98,10 @@ class _Kit:
                 ("changes some cells", self.acts, found),
                 ("refuses what is no strength", self.refuses, found),
             )
-        )
+        ):
+            first = told.setdefault(row.found, row.name)
+            is_again = row.outcome == "fail" and first != row.name
+            yield replace(row, found=f"as said of: {first}") if is_again else row
 
     @property
     def perturbation(self) -> Perturbation:

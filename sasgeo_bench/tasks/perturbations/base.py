@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import PerturbError
+from sasgeo_bench.core.texts import typed
 from sasgeo_bench.geometry.pose import rotation
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.streams import Streams
@@ -64,7 +65,17 @@ class Occlusion(ABC):
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
         """Hide the cells of `mask`."""
-        return evidence if self.share == 0 else hide(evidence, self.mask(evidence, rng))
+        if self.share == 0:
+            return evidence
+        mask: object = self.mask(evidence, rng)
+        shapes = (evidence.shape, evidence.cells.shape)
+        if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape not in shapes:
+            given = f"{mask.dtype} of shape {mask.shape}" if isinstance(mask, np.ndarray) else typed(mask)
+            raise PerturbError(
+                f"{type(self).__name__}: mask() returned {given}, expected an array of bool of shape {shapes[0]}, or "
+                f"{shapes[1]} for each class its own"
+            )
+        return hide(evidence, mask)
 
     @abstractmethod
     def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:

@@ -13,7 +13,7 @@ from sasgeo_bench.core.paths import given_path, plain_file, read_bounded
 from sasgeo_bench.core.plugins import CARD_FILE
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.matching.matcher import MOST_LEARNED_BYTES, MatcherCard, check_learned
-from sasgeo_bench.matching.submission import Card
+from sasgeo_bench.matching.submission import NEWER, Card
 
 _EXAMPLE: Final = "submit --example-card prints a sound one"
 _MOST_BYTES: Final = 100_000
@@ -81,7 +81,8 @@ def read_card_file(path: Path) -> Card:
     try:
         return config.parse_toml(text, Card, source=str(path))
     except ConfigError as error:
-        raise ConfigError(f"{error}: correct it there ({_EXAMPLE})") from error
+        mend = "" if NEWER in str(error) else f": correct it there ({_EXAMPLE})"
+        raise ConfigError(f"{error}{mend}") from error
 
 
 FOLDER: Final = "learned"  # next to the suites of a run

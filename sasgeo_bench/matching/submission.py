@@ -13,6 +13,7 @@ from sasgeo_bench.tasks.query import Track
 from sasgeo_bench.tasks.split import HALVES, Half
 
 SCHEMA_VERSION: Final = 1
+NEWER: Final = "install a sasgeo-bench that knows it"
 API: Final = 1  # version of the doors: what a plugin of it is given, and answers, stays as it is
 NONE: Final = "none"  # `trained_on` of a method that was not trained on any place of the split
 MOST_PLACES: Final = 1000
@@ -77,7 +78,7 @@ class Card(Document):
     @classmethod
     def _known_api(cls, api: int) -> int:
         if api != API:
-            raise ValueError(f"must be {API}, which this program knows, and not {api}: install one that knows it")
+            raise ValueError(f"api must be {API}, got {api}: {NEWER}")
         return api
 
     @property

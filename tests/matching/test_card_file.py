@@ -41,6 +41,8 @@ def test_what_is_wrong_is_said_with_the_file_and_a_pipe_is_not_waited_for(tmp_pa
         read_card(write(tmp_path, "licence", "# licence"))
     with pytest.raises(MatchError, match="tracks is empty"):
         read_card(write(tmp_path, "tracks =", "# tracks ="))
+    with pytest.raises(ConfigError, match=r"card\.toml: api must be 1, got 2: install a sasgeo-bench that knows it$"):
+        read_card(write(tmp_path, "api = 1", "api = 2"))
     (tmp_path / "card.toml").unlink()
     os.mkfifo(tmp_path / "card.toml")
     with pytest.raises(StoreError, match=r"card\.toml is no plain file: write a card there, or name one"):

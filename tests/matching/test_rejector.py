@@ -81,7 +81,10 @@ def test_a_card_that_does_not_say_enough_in_printable_lines_is_refused(field, va
         ([0.5, 1.5], "1.5 in place 1, expected 0..1"),
         ([-0.1, 0.5], "-0.1 in place 0"),
         ([0.5, float("nan")], "nan in place 1"),
-        (None, r"shape \(\), expected \(2,\)"),
+        (None, "returned NoneType, expected 2 numbers"),
+        (0.5, r"shape \(\), expected \(2,\)"),
+        (["0.5", "0.5"], "returned list, expected 2 numbers"),
+        ([0, 10**400], "returned list, expected 2 numbers"),
         (["a", "b"], "returned list, expected 2 numbers"),
     ],
 )

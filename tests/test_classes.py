@@ -46,14 +46,14 @@ RECIPES = {
 # Keys of a class that the generator of queries reads, and the scorer may not, and the other way round.
 OF_GENERATOR, OF_SCORER = {"published", "measured", "touched_by", "volatile"}, {"seen_share"}
 # A class that no map has yet, drawn as a detector sees car parks; nothing in a town is one.
-ANOTHER = """
+ANOTHER = f"""
 [[class]]
-id = 14
+id = {len(load_taxonomy().classes)}
 name = "solar"
 title = "field of solar panels"
 kind = "area"
 colour = "#101060"
-persistence = { prior = 0.9, vanish_per_year = 0.01, appear_per_year = 0.05 }
+persistence = {{ prior = 0.9, vanish_per_year = 0.01, appear_per_year = 0.05 }}
 paint = 45
 graph = "none"
 group = "none"
@@ -63,11 +63,11 @@ narrowest_m = 5.0
 standing_m = 0.0
 volatile = 3
 traits = ["drawn", "compared", "built", "blocks_areas", "blocks_lines", "clears"]
-seasons = { snow = "unknown" }
-seen_share = { snow = 0.5 }
-published = { recall = 0.7, precision = 0.7 }
-measured = { recall = 0.7, precision = 0.7 }
-rules = [{ key = "power", geometry = "area", values = ["plant", "generator"] }]
+seasons = {{ snow = "unknown" }}
+seen_share = {{ snow = 0.5 }}
+published = {{ recall = 0.7, precision = 0.7 }}
+measured = {{ recall = 0.7, precision = 0.7 }}
+rules = [{{ key = "power", geometry = "area", values = ["plant", "generator"] }}]
 """
 # Draws queries of a town; `sys.argv` holds the root, and what the taxonomy has besides.
 DRAW = """

@@ -350,16 +350,16 @@ def test_a_failed_control_is_told_where_it_cannot_be_overlooked(tmp_path):
 
 @pytest.mark.usefixtures("plain_site")
 def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path):
-    table = many_rows(2).assign(suite="my-suite", prior_group="my-group")
-    tasks = [{"suite": "my-suite", "region": "my-town"}]
+    table = many_rows(2).assign(suite="nobodys-suite", prior_group="my-group")
+    tasks = [{"suite": "nobodys-suite", "region": "my-town"}]
     made_by = {"pipeline": {"id": "x", "sha256": "y"}, "title": "A title of mine"}
     put_board(tmp_path / "mine", table=table, tasks=tasks, entries=[entry_of("unasked")], **made_by)
     told = []
     with reporting(told.append):
         pages = read(publish(tmp_path / "mine").folder)
     assert told == ["not on the map of places, for no region of that name ships: my-town"]
-    assert "This version knows no suite of that name" in " ".join(pages["suite-my-suite.html"].said("p"))
-    assert "my-suite: localization, my-group" in pages["index.html"].said("h3")
+    assert "This version knows no suite of that name" in " ".join(pages["suite-nobodys-suite.html"].said("p"))
+    assert "nobodys-suite: localization, my-group" in pages["index.html"].said("h3")
     assert "It has no figure on this board." in pages["matcher-unasked.html"].said("p")
     assert pages["index.html"].said("h1") == ["A title of mine"]
 

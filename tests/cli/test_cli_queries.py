@@ -181,7 +181,8 @@ def test_all_suites_are_listed_with_what_they_separate(program):
     code, told, err = program("list", "suites")
     assert (code, err) == (0, "")
     lines = told.splitlines()
-    assert [line.split()[0] for line in lines[1:] if line.strip()] == list(EVERY_SUITE)
+    listed = [line.split()[0] for line in lines[1:] if line.strip()]
+    assert listed[: len(EVERY_SUITE)] == list(EVERY_SUITE)  # suites of installed packages follow
     assert len(SUITES) == 17
     for name, suite in EVERY_SUITE.items():
         line = next(line for line in lines if line.startswith(f"{name} "))

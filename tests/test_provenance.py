@@ -23,7 +23,15 @@ from tests.world import answered, drawn, scored
 
 TOWN = "town-suburb"
 LINES = Provenance.model_fields
-STATED = {name: 2024 if int in get_args(line.annotation) else f"whose {name}" for name, line in LINES.items()}
+NUMBERS = {int: 2024, float: 20.24}
+
+
+def _stated(name):
+    """A value of a line: a number if its type is one, else a text."""
+    return next((value for kind, value in NUMBERS.items() if kind in get_args(LINES[name].annotation)), f"whose {name}")
+
+
+STATED = {name: _stated(name) for name in LINES}
 
 
 def region_text(**stated):

@@ -55,7 +55,7 @@ class BuildPlan:
 
     `source` is None for an embedded town, which is made during the build; `more` are further files of the extract.
     `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date, or
-    would be but for its provenance, which `region.json` alone holds.
+    would be but for its provenance, which `region.json` alone holds, or a preview.
     `with_preview` adds a picture of the layers, which takes longer than all else of a small region.
     """
 
@@ -123,7 +123,7 @@ def plan_build(
     is_newest = extract == spec.pick(None)
     folder = out / "regions" / (spec.id if is_newest else f"{spec.id}@{extract.date.isoformat()}")
     inputs = _inputs_sha256(spec, extract, sha256_of(source) if source else "")
-    grid, kept = spec.grid(), _kept(folder, inputs, with_preview=with_preview)
+    grid, kept = spec.grid(), _kept(folder, inputs)
     return BuildPlan(
         spec=spec,
         extract=extract,
@@ -131,7 +131,7 @@ def plan_build(
         grid=grid,
         folder=folder,
         inputs_sha256=inputs,
-        is_current=kept is not None and _states(kept, spec),
+        is_current=kept is not None and _states(kept, spec) and (_is_shown(kept) or not with_preview),
         more=more,
         pictures=tuple(
             check_picture(find_imagery(entry, folders=imagery_folders, extracts=extract_folders), entry, grid)
@@ -158,8 +158,8 @@ def package_version() -> str:
     return metadata.version("sasgeo-bench")
 
 
-def _kept(folder: Path, inputs_sha256: str, *, with_preview: bool) -> Manifest | None:
-    """Return the manifest of a region whose files are those that a build would write; None if they are not."""
+def _kept(folder: Path, inputs_sha256: str) -> Manifest | None:
+    """Return the manifest of a region whose files, but for a preview, a build would write; None if they are others."""
     try:
         manifest = region_files.read_manifest(folder)
     except StoreError:
@@ -168,8 +168,11 @@ def _kept(folder: Path, inputs_sha256: str, *, with_preview: bool) -> Manifest |
         (folder / name).is_file() and (folder / name).stat().st_size == record.bytes
         for name, record in manifest.files.items()
     )
-    is_shown = region_files.PREVIEW in manifest.files or not with_preview
-    return manifest if sizes_hold and is_shown and manifest.inputs_sha256 == inputs_sha256 else None
+    return manifest if sizes_hold and manifest.inputs_sha256 == inputs_sha256 else None
+
+
+def _is_shown(manifest: Manifest) -> bool:
+    return region_files.PREVIEW in manifest.files
 
 
 def _states(manifest: Manifest, spec: RegionFile) -> bool:
@@ -283,10 +286,7 @@ def _write_into(
         manifest = make_manifest(plan, extract, reading, graph)
         layers.result()
     if plan.with_preview:
-        from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview  # noqa: PLC0415 - only a picture needs matplotlib
-
-        overview = read_overview(scratch / region_files.LAYERS, longest_cells=PREVIEW_CELLS)
-        write_preview(scratch / region_files.PREVIEW, manifest=manifest, overview=overview)
+        _write_preview(scratch, manifest)
     files = {path.name: file_record(path) for path in sorted(scratch.iterdir())}
     manifest = manifest.model_copy(update={"files": files, "imagery": imagery})
     region_files.write_manifest(scratch, manifest)
@@ -361,14 +361,9 @@ def _write_unless_current(plan: BuildPlan, write: Callable[[Path], Manifest]) ->
     """Let `write` fill the folder of a region; return None if it is up to date, perhaps by a build we waited for."""
     try:
         with locked(plan.folder):
-            kept = _kept(plan.folder, plan.inputs_sha256, with_preview=plan.with_preview)
-            if kept is not None and _states(kept, plan.spec):
-                return None
+            kept = _kept(plan.folder, plan.inputs_sha256)
             if kept is not None:
-                tell(f"{plan.folder.name}: its provenance alone has changed: only {region_files.MANIFEST} is written")
-                kept = kept.model_copy(update={"provenance": plan.spec.provenance})
-                region_files.write_manifest(plan.folder, kept)
-                return kept
+                return _mend(plan, kept)
             with fresh_folder(plan.folder) as scratch:
                 return write(scratch)
     except SasgeoError:
@@ -377,6 +372,30 @@ def _write_unless_current(plan: BuildPlan, write: Callable[[Path], Manifest]) ->
         raise StoreError(
             f"{plan.folder} cannot be written ({error.strerror or error}): check the free space and your rights"
         ) from error
+
+
+def _mend(plan: BuildPlan, kept: Manifest) -> Manifest | None:
+    """Write what a region lacks whose map is up to date: lines of provenance, and a preview; None if nothing."""
+    name, mended = plan.folder.name, kept
+    if not _states(kept, plan.spec):
+        tell(f"{name}: its provenance alone has changed: only {region_files.MANIFEST} is written")
+        mended = mended.model_copy(update={"provenance": plan.spec.provenance})
+    if plan.with_preview and not _is_shown(kept):
+        tell(f"{name}: its map is up to date, and {region_files.PREVIEW} is drawn")
+        _write_preview(plan.folder, mended)
+        shown = {region_files.PREVIEW: file_record(plan.folder / region_files.PREVIEW)}
+        mended = mended.model_copy(update={"files": dict(sorted((mended.files | shown).items()))})
+    if mended is kept:
+        return None
+    region_files.write_manifest(plan.folder, mended)
+    return mended
+
+
+def _write_preview(folder: Path, manifest: Manifest) -> None:
+    from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview  # noqa: PLC0415 - only a picture needs matplotlib
+
+    overview = read_overview(folder / region_files.LAYERS, longest_cells=PREVIEW_CELLS)
+    write_preview(folder / region_files.PREVIEW, manifest=manifest, overview=overview)
 
 
 @contextmanager

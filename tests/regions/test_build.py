@@ -118,16 +118,21 @@ def test_layers_may_be_read_when_they_are_first_used_or_never(there):
             read()
 
 
-def test_a_map_on_the_way_to_queries_has_no_preview_until_one_is_wanted(tmp_path):
-    plan = plan_build(small(), out=tmp_path)
-    manifest = build_region(plan)
-    assert {path.name for path in plan.folder.iterdir()} == FILES - {"preview.png"}
-    assert plan_build(small(), out=tmp_path).is_current
-    shown, again = built(tmp_path, small())
+def test_a_map_on_the_way_to_queries_has_no_preview_until_one_is_wanted_and_it_alone_is_drawn(tmp_path, there):
+    whole, _ = there
+    out = tmp_path / "other"
+    plan = plan_build(small(), out=out)
+    build_region(plan)
+    before = {path.name: path.stat().st_mtime_ns for path in plan.folder.iterdir()}
+    assert set(before) == FILES - {"preview.png"}
+    assert plan_build(small(), out=out).is_current
+    shown, _ = built(out, small())
     assert not shown.is_current
-    assert {path.name for path in plan.folder.iterdir()} == FILES
-    assert (again.fingerprint, again.inputs_sha256) == (manifest.fingerprint, manifest.inputs_sha256)
-    assert plan_build(small(), out=tmp_path).is_current
+    after = {path.name: path.stat().st_mtime_ns for path in plan.folder.iterdir()}
+    assert {name for name in after if after[name] != before.get(name)} == {"preview.png", "region.json"}
+    for name in FILES:
+        assert (plan.folder / name).read_bytes() == (whole.folder / name).read_bytes(), name
+    assert plan_build(small(), out=out).is_current
 
 
 def test_every_file_carries_the_attribution(there):

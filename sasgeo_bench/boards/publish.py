@@ -149,7 +149,7 @@ def _source(files: BoardFiles) -> SiteSource:
         drawn = {file: SiteFigure.of(file, draw_text(draw, folder)) for file, draw in drawing.items()}
     return SiteSource(
         name=name,
-        title=about.title or (name if spec is None else spec.title),
+        title=_title_of(files.board, about.title or (name if spec is None else spec.title)),
         board=files.board,
         rates=book,
         registered=_registered(files, spec),
@@ -183,6 +183,12 @@ def _scenes_file(scenes: pd.DataFrame) -> Iterator[Download]:
 def _name_of(board: Board) -> str:
     pipeline = board.about.pipeline
     return pipeline.id if pipeline is not None else board.folder.resolve().name
+
+
+def _title_of(board: Board, title: str) -> str:
+    """Return a title after the board's own name, where that is not its pipeline's: it is another board."""
+    pipeline, own = board.about.pipeline, board.folder.resolve().name
+    return title if pipeline is None or own == pipeline.id else f"{own}: {title}"
 
 
 def _pipeline_of(pipeline: PipelineRecord | None) -> PipelineFile | None:

@@ -167,7 +167,11 @@ def _index(site: Site) -> dict[str, object]:
         "has_controls": bool(controls),
         "seed_line": seed_lines(about)[0],
         "sealed_lines": sealed_lines(about.sealed),
-        "warnings": [*map_lines(about), *warnings_of(source.board.leaderboard)],
+        "warnings": [
+            *(f"With a metric of another package: {one.name} ({one.code})." for one in about.metrics),
+            *map_lines(about),
+            *warnings_of(source.board.leaderboard),
+        ],
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
         "size": _size_text(source, book),
     }

@@ -83,6 +83,7 @@ def test_it_has_rows_a_column_and_a_name_and_the_board_lives_without_it(answered
     site = publish(board.folder, tmp_path / "site").folder
     for page in ("index.html", "suite-clean.html", "method.html"):
         assert whose in (site / page).read_text()
+    assert f"<li>With a metric of another package: nearness ({SPEC}).</li>" in (site / "index.html").read_text()
     with pytest.raises(MatchError, match=f"^{SPEC}: cannot be imported"):
         world.scored(answered, "later", metrics=[SPEC])
     stored = tmp_path / "stored"

@@ -361,7 +361,7 @@ def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path)
     assert "This version knows no suite of that name" in " ".join(pages["suite-nobodys-suite.html"].said("p"))
     assert "nobodys-suite: localization, my-group" in pages["index.html"].said("h3")
     assert "It has no figure on this board." in pages["matcher-unasked.html"].said("p")
-    assert pages["index.html"].said("h1") == ["A title of mine"]
+    assert pages["index.html"].said("h1") == ["mine: A title of mine"]
 
 
 # Bad input

@@ -68,6 +68,7 @@ ONLY_PARSED = {
 # Commands of other programs that are not run, each with its reason.
 OTHERS = {
     r"^pip install -e my-(matcher|segmenter|tracker|suite|metric|stress)$": "by hand: it needs the package registry",
+    r"^python -c .import pandas; print": "reads stored results of the checkout, which a desk of tests lacks",
     r"^(sha256sum |install -m 600 |source \.venv/bin/activate$)": "programs of the system, and of the shell",
     r"^podman ": "downloads and builds an image; tests/test_repository.py reads what it is built by",
     r"^bash findings/": "installs packages from the registry",

@@ -198,7 +198,7 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | Non
         listed = some.loc[some["failure"] == name, "query_id"]
         table.add_row(name, str(count), ", ".join(query_id[:SHOWN_LETTERS] for query_id in listed))
     stressed, total = int((cases.scores["role"] == STRESS).sum()), len(cases.scores)
-    only = f", {stressed} of the queries under stress: boards count these first, and controls separately" if stressed else ""
+    only = f", {stressed} of the queries under stress: boards count these first, and controls apart" if stressed else ""
     say(f"{cases.entry.name}: {counted(len(found), 'failure')} in {counted(total, 'query', 'queries')}{only}")
     print_table(table)
 

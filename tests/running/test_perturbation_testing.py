@@ -13,6 +13,7 @@ import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.scaffold import package_files, write_plugin
 from sasgeo_bench.running.perturbation_testing import check_perturbation
+from tests.slow import rest_slow
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,9 @@ def test_a_perturbation_that_breaks_a_rule_fails_there(named, tmp_path, rule, on
     assert all("\n" not in row.found for row in rows)
 
 
-@pytest.mark.parametrize("one", [Stripes, OwnStreams, Stripes(share=0.5), lambda strength: Stripes(share=strength)])
+@pytest.mark.parametrize(
+    "one", rest_slow([Stripes, OwnStreams, Stripes(share=0.5), lambda strength: Stripes(share=strength)], but=2)
+)
 def test_a_sound_class_instance_or_function_of_a_strength_keeps_every_rule(named, tmp_path, one):
     assert [row for row in check_perturbation(named(one), out=tmp_path) if row.outcome != "pass"] == []
 

@@ -18,6 +18,7 @@ from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metric, find
 from sasgeo_bench.scoring.metric_testing import check_metric, metric_files
 from sasgeo_bench.scoring.tables import leaderboard
 from tests.scoring.test_tables import scores
+from tests.slow import rest_slow
 
 
 def near(rows):
@@ -268,7 +269,7 @@ def test_a_metric_that_breaks_a_rule_fails_there(named, tmp_path, rule, one):
     assert all("\n" not in row.found for row in rows)
 
 
-@pytest.mark.parametrize("name", ["success_auc_50m", "recall_5", "ceiling", "longest_without_fix_m"])
+@pytest.mark.parametrize("name", rest_slow(["success_auc_50m", "recall_5", "ceiling", "longest_without_fix_m"]))
 def test_metrics_that_ship_keep_the_rules(tmp_path, name):
     assert {row.outcome for row in check_metric(name, out=tmp_path)} == {"pass"}
 

@@ -191,7 +191,7 @@ Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 ROUND: Final = "round.json"  # beside the tasks of a run, while all of it is asked again
-# Answers are scored and stored without the digits below these, which no figure shows and which are most of the bytes.
+# Answers are scored and stored without the digits below these, which are most of the bytes (record 5).
 # Powers of two: what is left out is zeros.
 STEP_M: Final = 2.0**-7
 STEP_DEG: Final = 2.0**-7

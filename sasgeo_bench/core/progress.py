@@ -15,6 +15,7 @@ from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from signal import SIG_DFL, SIGINT, signal
+from socket import gethostname
 from threading import Thread
 from types import FunctionType
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeVar, cast
@@ -169,7 +170,7 @@ def reported(work: Callable[[Item], Found]) -> Callable[[Item], Found]:
     A function that other processes can import is told each line at once, anything else when the item is done.
     """
     named = isinstance(_outlet.tell, FunctionType) and "<" not in _outlet.tell.__qualname__
-    return partial(_reported, work, _outlet.tell if named else None, os.getpid())
+    return partial(_reported, work, _outlet.tell if named else None, _here())
 
 
 class _Reported(NamedTuple, Generic[Found]):
@@ -179,8 +180,12 @@ class _Reported(NamedTuple, Generic[Found]):
     found: Found
 
 
-def _reported(work: Callable[[Item], Found], tell: Tell | None, parent: int, item: Item) -> Found:
-    if os.getpid() == parent:  # who listens there listens already
+def _here() -> tuple[str, int]:
+    return gethostname(), os.getpid()  # workers of a cluster may have the same number elsewhere
+
+
+def _reported(work: Callable[[Item], Found], tell: Tell | None, parent: tuple[str, int], item: Item) -> Found:
+    if _here() == parent:  # who listens there listens already
         return work(item)
     lines: list[str] = []
     with reporting(tell or lines.append):

@@ -7,12 +7,14 @@ import os
 import pickle
 import shutil
 import socket
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -293,3 +295,16 @@ def few_controls() -> Iterator[None]:
         patch.setattr(pipeline, "CONTROL_REGIONS", ("town-suburb",))
         patch.setattr(pipeline, "CONTROL_SITES", 1)
         yield
+
+
+@pytest.fixture
+def named(monkeypatch):
+    """Put something into a module, and return how it is named."""
+
+    def put(value):
+        module = ModuleType("module_of_mine")
+        module.ONE = value
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        return "module_of_mine:ONE"
+
+    return put

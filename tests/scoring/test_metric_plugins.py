@@ -6,7 +6,6 @@ import math
 import re
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pandas as pd
@@ -53,19 +52,6 @@ class Unarrayed:
         raise self.error
 
 
-@pytest.fixture
-def named(monkeypatch):
-    """Put something into a module, and return how it is named."""
-
-    def put(value):
-        module = ModuleType("metrics_of_mine")
-        module.ONE = value
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-        return "metrics_of_mine:ONE"
-
-    return put
-
-
 @pytest.mark.parametrize(
     ("value", "fault"),
     [
@@ -104,7 +90,7 @@ def named(monkeypatch):
 def test_what_is_no_metric_or_says_nothing_of_itself_is_refused_in_one_line(named, value, fault):
     with pytest.raises(MatchError) as refused:
         find_metric(named(value))
-    assert str(refused.value).startswith(f"metrics_of_mine:ONE: {fault}")
+    assert str(refused.value).startswith(f"module_of_mine:ONE: {fault}")
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 500
 
@@ -260,13 +246,19 @@ def ranks(rows):
         ("no answer is the worst there is", metric(lambda rows: np.where(rows["is_answered"], near(rows), 0.5))),
         ("no answer is the worst there is", metric(lambda rows: rows["is_answered"] * 1.0, better="lower")),
         ("a number, or NaN, for each query", metric(lambda rows: rows["position_error_m"])),
-        ("a number, or NaN, for each query", metric(lambda rows: np.full(len(rows), np.nan))),
     ],
 )  # fmt: skip
 def test_a_metric_that_breaks_a_rule_fails_there(named, tmp_path, rule, one):
     rows = list(check_metric(named(one), out=tmp_path))
     assert f"localization: {rule}" in [row.name for row in rows if row.outcome == "fail"]
     assert all("\n" not in row.found for row in rows)
+
+
+def test_a_metric_that_counts_nothing_in_the_small_town_is_not_said_to_pass(named, tmp_path):
+    nothing = metric(lambda rows: np.full(len(rows), np.nan))
+    last = list(check_metric(named(nothing), out=tmp_path))[-1]
+    assert last.outcome == "not applicable"
+    assert "so nothing is checked" in last.found
 
 
 @pytest.mark.parametrize("name", rest_slow(["success_auc_50m", "recall_5", "ceiling", "longest_without_fix_m"]))

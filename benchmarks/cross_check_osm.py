@@ -131,10 +131,12 @@ def with_rules(found: pd.DataFrame, plain: Plain, frame: Frame) -> list[dict[str
         facts = Facts.read(plain.source, frame, ways=ways, relations=[*differ["id"][~is_way], *around])
         for row in differ.to_dict("records"):
             above = plain.above.get(row["id"], ()) if row["kind"] == "w" else ()
-            is_told = any((owner, row["class"]) in told for owner in above)
+            is_reported = any((owner, row["class"]) in told for owner in above)
             kept = {name: row[name] for name in KEY}
             told_sizes = (row["size_ours"], row["size_gdal"])
-            case = Case(row["kind"], row["id"], row["class"], row["form"], *told_sizes, is_told=is_told, facts=facts)
+            case = Case(
+                row["kind"], row["id"], row["class"], row["form"], *told_sizes, is_reported=is_reported, facts=facts
+            )
             other = row[f"size_{reader}"]
             rule = explain(case, rules)
             listed.append({"reader": reader, **kept, "ours": row["size_ours"], "other": other, "rule": rule})

@@ -165,7 +165,7 @@ def try_settings(
         rows = []
         for flight in flights:
             tracker = trackers[flight[0][0].region]
-            vars(tracker).update(temper=temper, doubt=doubt)
+            vars(tracker).update(exponent_scale=temper, outlier_probability=doubt)
             rows += list(score(tracker, flight))
         near, accepted, log, _ = np.mean(rows, axis=0)
         nees = np.median([row[3] for row in rows if row[1]] or [math.nan])

@@ -21,10 +21,10 @@ from pathlib import Path
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.tasks.build import make_tasks, read_scene
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
-from sasgeo_bench.tasks.suites.base import Scene, Seeds, Shot, Suite
+from sasgeo_bench.tasks.suites.base import Scene, Seeds, Suite, ViewRequest
 from sasgeo_bench.tasks.suites.mining import describe, mine
 from sasgeo_bench.tasks.suites.sites import choose_sites
-from sasgeo_bench.tasks.task_plan import Request, Wanted, is_reachable, plan_requests
+from sasgeo_bench.tasks.task_plan import Request, TaskRequest, is_reachable, plan_requests
 
 VIEW_CELLS = 192
 SITES = 12
@@ -46,7 +46,7 @@ FEW, MANY = 8, 64
 
 def request_for(region: str, suite: str, count: int, out: Path, extracts: list[Path]) -> Request:
     """One request on the cross-fit split."""
-    wanted = Wanted(
+    wanted = TaskRequest(
         suites=(suite,),
         regions=(region,),
         split="crossfit",
@@ -70,7 +70,7 @@ def draws_per_second(suite: Suite, scene: Scene, runs: int) -> float:
         start = time.perf_counter()
         for site in sites:
             for variant in variants:
-                suite.draw(Shot(scene=scene, site=site, variant=variant, seeds=seeds.under("site", site.index)))
+                suite.draw(ViewRequest(scene=scene, site=site, variant=variant, seeds=seeds.under("site", site.index)))
         rates.append(len(sites) * len(variants) / (time.perf_counter() - start))
     return statistics.median(rates)
 

@@ -147,7 +147,7 @@ def by_nesting(relation: Relation, facts: Facts) -> shapely.Geometry:
 class Case:
     """One object, class and form that two readings differ on.
 
-    `is_told` says that it is an outer way of a relation which has the class in our reading.
+    `is_reported` says that it is an outer way of a relation which has the class in our reading.
     """
 
     kind: str
@@ -156,7 +156,7 @@ class Case:
     form: str
     ours: float
     gdal: float
-    is_told: bool
+    is_reported: bool
     facts: Facts
 
     @property
@@ -277,7 +277,7 @@ def hole_told_as_its_area(case: Case) -> float | None:
 
 def class_of_the_relation(case: Case) -> float | None:
     """An outer way with a class that its relation has: counted once, with the relation."""
-    return 0.0 if case.is_told else None
+    return 0.0 if case.is_reported else None
 
 
 GDAL_RULES: Final[tuple[Rule, ...]] = (

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """How many small faults in the code the tests find: a mutation score, by room, with its 95 % interval.
 
-    python -m pip install cosmic-ray==8.7.0
+    python -m pip install cosmic-ray==8.7.0 coverage
     python benchmarks/mutants.py --into out/mutants.csv --jobs 2
 
 A sample of all mutants that Cosmic Ray can make of some rooms is drawn by a seed. Each is put into a copy of the
-checkout and tried by the tests of its module, else by those of its room, up to the first that fails; one that keeps
-the processor for more than `LONGEST_S`, or hangs for ten times that, is found, too. Rows are written as they come, so
-that a run that was cut off goes on.
+checkout and tried by the tests of its module, else by those of its room, up to the first that fails: first by those
+that run its line; by all if the line is run by an import, by a fixture that tests share, or in no test's own process.
+One that keeps the processor for more than `LONGEST_S`, or hangs for ten times that, is found, too. Rows are written as
+they come, so that a run that was cut off goes on.
 """
 
 import argparse
+import ast
 import csv
 import os
 import random
@@ -26,6 +28,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Final, NamedTuple
 
+import pytest
+
 from sasgeo_bench.scoring.intervals import wilson
 
 ROOT: Final = Path(__file__).parents[1]
@@ -36,6 +40,9 @@ LONGEST_S: Final = 300
 _LEFT_OUT: Final = re.compile(r"Bit(Or|And|Xor)|Shift|_(Mod|FloorDiv|Pow)$|RemoveDecorator|ExceptionReplacer")
 _COPIED: Final = ("sasgeo_bench", "tests", "baselines", "paper", "benchmarks", "pipelines", "regions", "splits", "docs",
                   "pyproject.toml", "README.md", "CONTRIBUTING.md")  # fmt: skip
+
+
+_PYTEST: Final = ("-x", "-q", "-p", "no:benchmark", "-p", "no:cacheprovider")
 
 
 class Mutant(NamedTuple):
@@ -78,7 +85,90 @@ def tests_of(module: str) -> list[str]:
     return [module, *dict.fromkeys([*first, *names])] if first or names else [module, room.as_posix()]
 
 
-def tried(mutant: Mutant, copy: Path) -> str:
+class Contexts:
+    """A plugin of pytest that tells coverage.py which test runs."""
+
+    def __init__(self) -> None:
+        self._test = ""
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        """Name a test without its parameters."""
+        self._test = item.nodeid.partition("[")[0]
+        _switch(self._test)
+        return (yield)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: pytest.FixtureDef) -> Iterator[None]:
+        """Lay what more than one test uses to none of them."""
+        if fixturedef.scope == "function":
+            return (yield)
+        _switch("")
+        try:
+            return (yield)
+        finally:
+            _switch(self._test)
+
+
+def _switch(context: str) -> None:
+    from coverage import Coverage  # noqa: PLC0415
+
+    running = Coverage.current()
+    if running is not None:
+        running.switch_context(context)
+
+
+def trace(tests: list[str], into: Path) -> int:
+    """Run tests of the folder that we are in, and write into a file of coverage.py which of them run which line."""
+    from coverage import Coverage  # noqa: PLC0415
+
+    watched = Coverage(data_file=into, source=[str(Path.cwd() / "sasgeo_bench")], config_file=False)
+    watched.start()
+    code = pytest.main([*_PYTEST, *tests], plugins=[Contexts()])
+    watched.stop()
+    watched.save()
+    return code
+
+
+class Lines:
+    """Which tests run which line, as coverage.py has it."""
+
+    def __init__(self, data: Path, copy: Path) -> None:
+        from coverage import CoverageData  # noqa: PLC0415
+
+        self._data, self._copy = CoverageData(basename=str(data)), copy
+        self._data.read()
+
+    def tests(self, mutant: Mutant) -> list[list[str]]:
+        """Return the lists of tests that a mutant is tried by, in turn."""
+        own = tests_of(mutant.module)
+        run = self._data.contexts_by_lineno(str(self._copy / mutant.module))
+        contexts = {each for line in _statement(self._copy / mutant.module, mutant.line) for each in run.get(line, [])}
+        chosen = sorted(
+            (each for each in contexts if each and any(_is_within(each, test) for test in own)),
+            key=lambda each: next(number for number, test in enumerate(own) if _is_within(each, test)),
+        )
+        # A test that was told to coverage.py twice, or a fixture that is the caller's own, costs nothing but time.
+        return [chosen] if chosen and "" not in contexts else [*([chosen] if chosen else []), own]
+
+
+def _is_within(nodeid: str, test: str) -> bool:
+    return nodeid.startswith((f"{test}::", f"{test}/"))
+
+
+def _statement(path: Path, line: int) -> range:
+    """Return the lines of the innermost statement around a line; of one with a body, those before it."""
+    best = range(line, line + 1)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.stmt):
+            body = getattr(node, "body", None)
+            end = body[0].lineno if body else (node.end_lineno or node.lineno) + 1
+            if node.lineno <= line < end:
+                best = range(node.lineno, end)
+    return best
+
+
+def tried(mutant: Mutant, copy: Path, tests: list[list[str]]) -> str:
     """Put a mutant into a copy of the checkout, run its tests, and take it out again; return what came of it."""
     from cosmic_ray.mutating import mutate_code  # noqa: PLC0415
     from cosmic_ray.plugins import get_operator  # noqa: PLC0415
@@ -90,7 +180,8 @@ def tried(mutant: Mutant, copy: Path) -> str:
         return "none"
     path.write_text(mutated, encoding="utf-8")
     try:
-        return outcome_of(tests_of(mutant.module), copy)
+        outcomes = (outcome_of(some, copy) for some in tests)
+        return next((outcome for outcome in outcomes if outcome != "left"), "left")
     finally:
         path.write_text(code, encoding="utf-8")
 
@@ -101,13 +192,11 @@ def outcome_of(tests: list[str], copy: Path, *, longest_s: int = LONGEST_S) -> s
     Time of the processor counts, so that a busy machine finds no more mutants.
     """
     limited = ["sh", "-c", f'ulimit -t {longest_s}; exec "$@"', "sh"]
-    command = [*limited, sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:benchmark", "-p", "no:cacheprovider"]
-    outside = os.environ | {"PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     try:
         ended = subprocess.run(  # noqa: S603 - our own tests
-            [*command, *tests],
+            [*limited, sys.executable, "-m", "pytest", *_PYTEST, *tests],
             cwd=copy,
-            env=outside,
+            env=_environment(copy),
             check=False,
             timeout=10 * longest_s,
             capture_output=True,
@@ -116,6 +205,10 @@ def outcome_of(tests: list[str], copy: Path, *, longest_s: int = LONGEST_S) -> s
         return "late"
     known = {0: "left", 1: "found", -signal.SIGXCPU: "late", -signal.SIGKILL: "late"}
     return known.get(ended.returncode, f"found ({ended.returncode})")
+
+
+def _environment(copy: Path) -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def copied(folder: Path) -> Path:
@@ -134,7 +227,10 @@ def main() -> None:
     parser.add_argument("--mutants", type=int, default=MUTANTS, help="how many of all are drawn")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--trace", nargs="+", metavar="TEST", help="run these under coverage.py into --into instead")
     words = parser.parse_args()
+    if words.trace:
+        sys.exit(trace(words.trace, words.into))
     every = list(mutants_of(words.rooms))
     drawn = random.Random(words.seed).sample(every, words.mutants)  # noqa: S311 - a sample, no secret
     known = _read(words.into)
@@ -147,13 +243,24 @@ def main() -> None:
             copies.put(copied(Path(scratch) / str(number)))
 
         every_test = list(dict.fromkeys(test for mutant in left for test in tests_of(mutant.module)))
-        if left and outcome_of(every_test, Path(scratch) / "0", longest_s=20 * LONGEST_S) != "left":
+        where = Path(scratch) / "0"
+        command = [
+            sys.executable,
+            str(Path(__file__).resolve()),
+            "--into",
+            str(where / "lines"),
+            "--trace",
+            *every_test,
+        ]
+        if left and subprocess.run(command, cwd=where, env=_environment(where), check=False).returncode:  # noqa: S603
             sys.exit("these tests fail without a mutant, so they tell nothing of one")
+        lines = Lines(where / "lines", where) if left else None
+        tests = {mutant: lines.tests(mutant) for mutant in left} if lines else {}
 
         def one(mutant: Mutant) -> tuple[Mutant, str]:
             copy = copies.get()
             try:
-                return mutant, tried(mutant, copy)
+                return mutant, tried(mutant, copy, tests[mutant])
             finally:
                 copies.put(copy)
 

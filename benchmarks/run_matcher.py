@@ -18,7 +18,7 @@ from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 TOWN = "town-riverside"
 MATCHERS = ("random", "prior_centre", "map_density_prior", "global_descriptor", "raster_uniform", "fft_vote")
@@ -38,7 +38,7 @@ class Row:
 
 def town_task(out: Path) -> Path:
     """A task of some hundred queries of all sizes."""
-    wanted = Wanted(
+    wanted = TaskRequest(
         suites=("occlusion",), regions=(TOWN,), split="crossfit", count=8, seed=0, out=out, may_be_fewer=True
     )
     (made,) = make_tasks(plan_requests(wanted)[0])

@@ -24,14 +24,14 @@ from hypothesis import HealthCheck, settings
 from sasgeo_bench import cli
 from sasgeo_bench.boards import board_pictures, build
 from sasgeo_bench.boards.board_figures import figures_extra
-from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.boards.board_files import AdditionalFiles
 from sasgeo_bench.core import progress
 from sasgeo_bench.experiments import pipeline
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.testing import TinyPlace, tiny_place
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.threaded import threaded
 
 # No test depends on how busy the machine is, nor on chance: the same examples each time. To go on searching:
@@ -150,7 +150,7 @@ def tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         made = (("clean", "town-riverside"), ("absent", "town-riverside"), ("alias", "town-grid"))
         for suite, region in (*made, ("topology-twins", "town-grid"), ("no-priors", "town-riverside")):
             count = 2 if suite == "clean" else 1
-            wanted = Wanted(suites=(suite,), regions=(region,), split="crossfit", count=count, seed=0, out=out)
+            wanted = TaskRequest(suites=(suite,), regions=(region,), split="crossfit", count=count, seed=0, out=out)
             for request in plan_requests(wanted):
                 make_tasks(request)
 
@@ -248,7 +248,7 @@ def without_drawings() -> Iterator[None]:
     """Boards of pipelines and of the program have no figures and no pictures: for tests that are about rows."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("figures_extra", "pictures_extra"):
-            patch.setattr(build, name, lambda *_, **__: Extra())
+            patch.setattr(build, name, lambda *_, **__: AdditionalFiles())
         yield
 
 
@@ -256,7 +256,7 @@ def without_drawings() -> Iterator[None]:
 def without_pictures() -> Iterator[None]:
     """Boards of pipelines and of the program have no pictures: for tests that are about rows and figures."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "pictures_extra", lambda *_, **__: Extra())
+        patch.setattr(build, "pictures_extra", lambda *_, **__: AdditionalFiles())
         yield
 
 
@@ -267,7 +267,7 @@ def few_figures() -> Iterator[None]:
     All are drawn where the test is about them.
     """
 
-    def few(*about: Any, **more: Any) -> Extra:
+    def few(*about: Any, **more: Any) -> AdditionalFiles:
         extra = figures_extra(*about, **more)
         return replace(extra, figures=dict(islice(extra.figures.items(), 2)))
 

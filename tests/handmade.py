@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.boards.board_files import ANSWER_SCHEMA, Extra, write_board
+from sasgeo_bench.boards.board_files import ANSWER_SCHEMA, AdditionalFiles, write_board
 from sasgeo_bench.boards.manifests import BoardManifest
 from sasgeo_bench.boards.plots import BoardPage
 from sasgeo_bench.core.canvas import page
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
-from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.scoring.contrasts import Contrast, evaluate_contrasts
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, RUN_HERE, EntryLabel, Row, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION
@@ -104,7 +104,7 @@ def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), score
             "controls": CONTROL_SCHEMA.frame(verdicts),
         },
         about=about_of(list(entries), **about),
-        extras=[Extra(texts={"leaderboard.md": "# Board\n", "leaderboard.tex": "% board\n"}), *extras],
+        extras=[AdditionalFiles(texts={"leaderboard.md": "# Board\n", "leaderboard.tex": "% board\n"}), *extras],
     )
     return folder
 
@@ -150,11 +150,11 @@ def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=Non
         folder,
         table=pd.concat([leaderboard(scored, draws=200), FIGURE_SCHEMA.frame([*judged, *costs])], ignore_index=True),
         entries=[entry_of(name, **(changes or {}).get(name, {})) for name in shares],
-        findings=hold_contrasts(known, scored, {}, draws=200),
+        findings=evaluate_contrasts(known, scored, {}, draws=200),
         verdicts=[replace(verdict(holds=holds), matcher=tested)],
         scored=pd.concat([frame.assign(matcher=name) for name, frame in scored.items()], ignore_index=True),
         extras=[
-            Extra(
+            AdditionalFiles(
                 figures={"age-real-age-localization-r500-weak-s3.svg": draw},
                 tables={"answers": answers_of([*shares, "__proto__"])},  # a name that means something in JavaScript
             )

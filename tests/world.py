@@ -12,7 +12,7 @@ from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.split import find_split
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.threaded import threaded
 
 
@@ -27,7 +27,7 @@ def built(spec: RegionFile | str, out: Path, **options: Any) -> Path:
 def drawn(out: Path, suite: str, *regions: str, **changes: Any) -> list[Path]:
     """Draw a suite in regions, which are built where they are missing; return the folders of the tasks."""
     said = {"split": "crossfit", "count": 1, "seed": 0} | changes
-    wanted = Wanted(suites=(suite,), regions=regions, out=out, **said)
+    wanted = TaskRequest(suites=(suite,), regions=regions, out=out, **said)
     for request in plan_requests(wanted):
         make_tasks(request)
     return [out / "tasks" / suite / region for region in regions]

@@ -64,7 +64,7 @@ def oracle_card(card: MatcherCard) -> MatcherCard:
 
 
 class OracleObjects:
-    """A matcher of objects that is told where its view is, and reads the map's objects there."""
+    """A matcher of objects that gets the place of its view, and reads the map's objects there."""
 
     inner: ClassVar[type[Matcher]]
     card: MatcherCard

@@ -168,7 +168,7 @@ class RareClass:
 # The row is there, with its interval. `out/boards/first/leaderboard.md` holds the whole board, with costs, strata and
 # the meaning of each column.
 #
-# Two sites in one place are one block, or few. Intervals are wide, and with fewer than six blocks nobody is ranked:
+# Two sites in one place are one block, or few. Intervals are wide, and with fewer than six blocks no entry is ranked:
 # the board says so instead of showing an order that the next draw would change. For a row that can be ranked, ask more
 # sites in more places: `sasgeo-bench leaderboard demo --matcher rare_class:RareClass`.
 #

@@ -11,7 +11,7 @@ from typing import Final
 
 import pandas as pd
 
-from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.boards.board_files import AdditionalFiles
 from sasgeo_bench.boards.scored import Scored
 from sasgeo_bench.boards.tables import p_text
 from sasgeo_bench.boards.text import markdown_table
@@ -201,7 +201,7 @@ CAPTIONS: Final = {
 }
 
 
-def extra(board: Scored, *, root: Path) -> Extra:
+def extra(board: Scored, *, root: Path) -> AdditionalFiles:
     """Return the table next to the paper's, all trials, and figures; `root` holds tasks/, truth/ and regions/."""
     tasks = [Task.of(about, root) for about in board.tasks if about.suite == SUITE]
     by_id = {truth.query_id: truth for task in tasks for truth in task.truths}
@@ -209,7 +209,7 @@ def extra(board: Scored, *, root: Path) -> Extra:
     summary = _summaries(board, trials)
     seeds = sorted(set(trials["seed"]))
     about = {"trials": _in_words(seeds, len(by_id)), "made_by": f"sasgeo-bench {version('sasgeo-bench')}", "data": DATA}
-    return Extra(
+    return AdditionalFiles(
         tables={"paper": summary, "trials": trials},
         texts={
             "paper.md": paper_markdown(

@@ -68,7 +68,7 @@ from sasgeo_bench.tasks.task_files import (
     TRUTH_SCHEMA,
     VIEW_BYTES,
     Task,
-    asked_under,
+    answer_hash,
     with_added,
 )
 
@@ -625,7 +625,7 @@ def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into:
             (run / cards.FOLDER).mkdir(exist_ok=True)
             (run / cards.FOLDER / _learned_name(manifest.learned)).write_text(row[LEARNED], encoding="utf-8")
         part = answers.slice(start, count)
-        ties = [asked_under(asked[name], manifest.key) for name in part["query_id"].to_pylist()]
+        ties = [answer_hash(asked[name], manifest.key) for name in part["query_id"].to_pylist()]
         write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
         start += count
         yield place

@@ -14,7 +14,7 @@ from sasgeo_bench.boards.board_files import (
     MEND,
     SCHEMAS,
     TABLES,
-    Extra,
+    AdditionalFiles,
     read_board_manifest,
     read_leaderboard,
     write_board,
@@ -80,7 +80,7 @@ class Board:
             SCHEMAS[name].check(table)
         return cls(folder=folder, about=about, leaderboard=leaderboard, **tables)
 
-    def save(self, extras: Sequence[Extra], *, failed: Mapping[str, str]) -> Self:
+    def save(self, extras: Sequence[AdditionalFiles], *, failed: Mapping[str, str]) -> Self:
         """Write the board with texts, figures and pictures, all or nothing; return it with what failed meanwhile.
 
         Tables that a board may lack are not written if they are empty. `failed` grows until the last figure is drawn.

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.boards.board_files import AdditionalFiles
 from sasgeo_bench.boards.flight_plots import (
     distance_frame,
     draw_distance,
@@ -80,7 +80,7 @@ OTHERS: Final = ("ablation", "recall", "errors", "price", "cost", "drift")  # st
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
 
 
-def figures_extra(scored: Scored, *, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
+def figures_extra(scored: Scored, *, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> AdditionalFiles:
     """Return the figures of a board, as SVG.
 
     Report the kinds of figures that lack data. `contrasts` are the registered ones; `split` assigns the
@@ -131,7 +131,7 @@ def figures_extra(scored: Scored, *, contrasts: Sequence[Contrast] = (), split: 
             empty += [] if found else [what]
     if empty:
         tell(f"figures left out, for nothing on this board is seen in them: {'; '.join(empty)}")
-    return Extra(figures=drawn)
+    return AdditionalFiles(figures=drawn)
 
 
 def _file_name(*parts: str) -> str:

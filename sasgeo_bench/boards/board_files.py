@@ -59,7 +59,7 @@ _TOP: Final = (*BOARD_FILES, FIGURES, PICTURES, *SITE_FOLDERS)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extra:
+class AdditionalFiles:
     """Additional files of a board.
 
     `tables` become <name>.parquet, `texts` files by name. `figures` maps names in `figures/` to functions that draw to
@@ -78,7 +78,7 @@ def write_board(
     tables: Mapping[str, pd.DataFrame],
     about: BoardManifest,
     failed: Mapping[str, str] | None = None,
-    extras: Sequence[Extra] = (),
+    extras: Sequence[AdditionalFiles] = (),
 ) -> None:
     """Write a board completely or not at all; an older board of the same scorer version there is replaced.
 
@@ -93,7 +93,7 @@ def write_board(
         with locked(folder):
             check_board(folder, scorer_version=about.scorer_version)
             with fresh_folder(folder) as scratch:
-                for part in (Extra(tables=tables), *extras):
+                for part in (AdditionalFiles(tables=tables), *extras):
                     _write_part(scratch, part, metadata)
                 for name in (one for one in _AS_CSV if one in tables):
                     (scratch / f"{name}.csv").write_text(csv_text(tables[name]), encoding="utf-8", newline="")
@@ -124,7 +124,7 @@ def csv_text(table: pd.DataFrame) -> str:
     return str(table.assign(**safe).to_csv(index=False, lineterminator="\n"))
 
 
-def _write_part(folder: Path, part: Extra, metadata: Mapping[str, str]) -> None:
+def _write_part(folder: Path, part: AdditionalFiles, metadata: Mapping[str, str]) -> None:
     for name, frame in part.tables.items():
         write_frame(frame, folder / f"{name}.parquet", attrs=metadata, **metadata)
     for name, text in part.texts.items():

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.boards.board_files import ANSWER_SCHEMA, ANSWERS, PICTURES_FILE, Extra
+from sasgeo_bench.boards.board_files import ANSWER_SCHEMA, ANSWERS, PICTURES_FILE, AdditionalFiles
 from sasgeo_bench.boards.cases import (
     COLUMNS,
     MOST_CASES,
@@ -38,7 +38,7 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.preview import paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
-from sasgeo_bench.running.failures import Failures, stops_all
+from sasgeo_bench.running.failures import Failures, is_disk_error
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.contrasts import Contrast
@@ -81,7 +81,7 @@ class _Found:
             self.lacking[one_line(str(error))] += 1
             return
         except Exception as error:
-            if stops_all(error):
+            if is_disk_error(error):
                 raise
             self.failures.note(f"picture {name}", error)
             return
@@ -105,7 +105,7 @@ def pictures_extra(
     split: Split | None = None,
     has_cases: bool = True,
     jobs: int = 1,
-) -> Extra:
+) -> AdditionalFiles:
     """Draw pictures of a board, and list them in `pictures.json`; empty if there is none.
 
     `root` holds regions/, tasks/ and truth/; tasks that are missing there, or of other queries, have no picture. Report
@@ -136,10 +136,10 @@ def pictures_extra(
     )
     tell(f"pictures: {listed}, {sum(map(len, found.files.values())) / 1e6:.2f} MB")
     if not found.files:
-        return Extra(tables=answers)
+        return AdditionalFiles(tables=answers)
     kinds = {kind: [item.model_dump(mode="json") for item in items] for kind, items in found.listed.items()}
     content = json_text({**kinds, "licence": LICENCE, "attribution": ATTRIBUTION})
-    return Extra(tables=answers, pictures={**found.files, PICTURES_FILE: content.encode()})
+    return AdditionalFiles(tables=answers, pictures={**found.files, PICTURES_FILE: content.encode()})
 
 
 def _there(about: TaskManifest, root: Path) -> Task | None:

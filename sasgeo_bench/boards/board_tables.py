@@ -53,7 +53,7 @@ from sasgeo_bench.scoring.controls import Falsifier, Verdict
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, mixture_name
-from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
+from sasgeo_bench.scoring.rows import ALL_SUITES, base_name, is_unranked
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, MOST_STEPS, STRESS, is_bin, is_step
 from sasgeo_bench.scoring.tables import AS_USED, SCENES
@@ -324,13 +324,13 @@ def _value_of(row: Record | None) -> float:
 
 def _notes(book: Book, ties: Sequence[Tie], found: Mapping[str, Record], ranked: int) -> tuple[str, ...]:
     if not found:
-        return ("Nobody has a figure here.",)
+        return ("No entry has a value here.",)
     if ranked:
         lines = [f"Tied: {tie.to_text()}." for tie in ties]
         return tuple(lines or (["No two share a rank."] if ranked > 1 else ["One alone is ranked."]))
     if book.controls.issuperset(found):
         return ("Only controls answered.",)
-    return ("Nobody is ranked here: the order is that of the figure, and decides nothing.",)
+    return ("Sorted by value; entries are not ranked in this table.",)
 
 
 def _for_nothing(book: Book, key: Key) -> str:
@@ -338,7 +338,7 @@ def _for_nothing(book: Book, key: Key) -> str:
     _, track, _ = key
     primary = primary_of(track).name
     what, control = ("the odometer alone", _ODOMETER_ALONE) if track == SEQUENCE else ("the prior alone", _PRIOR_ALONE)
-    alone = next((name for name in book.matchers[key] if name_alone(name) == control), None)
+    alone = next((name for name in book.matchers[key] if base_name(name) == control), None)
     found = {
         what: None if alone is None else book.main(key, alone, primary),
         "chance": book.main(key, book.matchers[key][0], CHANCE.name),
@@ -521,7 +521,7 @@ def _overview_notes(primary: str, rows: Sequence[Row], *, has_absent: bool, has_
     if any(row.cells[0].text == AT_MOST for row in rows):
         yield (
             f"{AT_MOST}: what can be expected of a matcher that sees the view alone, as 1 in k where k places are the "
-            "same. An oracle is told the answer and passes it."
+            "same. An oracle gets the answer and passes it."
         )
 
 
@@ -594,7 +594,7 @@ _RISK_NOTES: Final = (
 )
 _BY_SUITE_NOTES: Final = (
     "One threshold for all suites: where a suite is hard, more of its answers are false.",
-    "Controls and falsifiers of twins and of alias count, of which nobody can tell the two places apart.",
+    "Controls and falsifiers of twins and of alias count, whose two places cannot be told apart.",
 )
 SHOWN_RATIO: Final = 20.0  # of the costs of a false fix and of withholding a right one
 _MIXTURES: Final = (AS_DRAWN, *map(mixture_name, PRESENT_SHARES))
@@ -624,7 +624,7 @@ def _rejection_rows(board: pd.DataFrame) -> pd.DataFrame:
 
 
 def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: bool = False) -> Table:
-    """Return rejectors, the best first and those of controls last, whose order of answers nobody earned.
+    """Return rejectors, the best first and those of controls last, whose order of answers is arbitrary.
 
     `has_queries` adds a column of the track and prior group of each line.
     """

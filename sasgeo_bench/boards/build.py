@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from sasgeo_bench.boards.board_figures import figures_extra
-from sasgeo_bench.boards.board_files import Extra, read_board_manifest
+from sasgeo_bench.boards.board_files import AdditionalFiles, read_board_manifest
 from sasgeo_bench.boards.board_pictures import pictures_extra
 from sasgeo_bench.boards.plots import age_names, ages_frame
 from sasgeo_bench.boards.score import score_board
@@ -20,7 +20,7 @@ from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.strata import queries_of, steps_frame
 
 
-def make_board(request: ScoreRequest, extras: Sequence[Callable[[Scored], Extra]] = ()) -> Scored:
+def make_board(request: ScoreRequest, extras: Sequence[Callable[[Scored], AdditionalFiles]] = ()) -> Scored:
     """Score everything, draw what `extras` make of it, and write the board; return it with what it was made of.
 
     Raise as `score_board` does, or StoreError if the board cannot be written; nothing is written then.
@@ -33,7 +33,7 @@ def make_board(request: ScoreRequest, extras: Sequence[Callable[[Scored], Extra]
     return replace(scored, board=board.save([texts, *drawn], failed=scored.failures.found))
 
 
-def drawings(request: ScoreRequest, *, has_cases: bool = True) -> tuple[Callable[[Scored], Extra], ...]:
+def drawings(request: ScoreRequest, *, has_cases: bool = True) -> tuple[Callable[[Scored], AdditionalFiles], ...]:
     """Return what draws the figures and the pictures of a board; `has_cases` shows failed queries with their truths."""
     return (
         partial(figures_extra, contrasts=request.contrasts, split=request.split),
@@ -61,11 +61,11 @@ def _tell_what_goes(folder: Path, scored: Scored) -> None:
         tell(f"{folder / SITE} is of the older board and is removed with it: publish again")
 
 
-def make_extras(scored: Scored, extras: Sequence[Callable[[Scored], Extra]]) -> list[Extra]:
+def make_extras(scored: Scored, extras: Sequence[Callable[[Scored], AdditionalFiles]]) -> list[AdditionalFiles]:
     """Return the additional files; leave out what cannot be made, and figures that cannot be drawn."""
     if extras:
         tell("drawing figures and pictures")
-    found: list[Extra] = []
+    found: list[AdditionalFiles] = []
     for make in extras:
         with scored.failures.of("more of the board"):
             extra = make(scored)
@@ -82,7 +82,7 @@ def _draw(draw: Callable[[Path], object], name: str, failures: Failures, path: P
     path.unlink(missing_ok=True)
 
 
-def board_texts(scored: Scored) -> Extra:
+def board_texts(scored: Scored) -> AdditionalFiles:
     """Return the tables of a board as a document and for a paper."""
     board, queries = scored.board, queries_of(scored.scores)
     steps = steps_frame(board.leaderboard, queries, sorted(scored.scores))
@@ -97,4 +97,4 @@ def board_texts(scored: Scored) -> Extra:
         steps=steps,
         ages=age_names(ages_frame(steps, queries, scored.measured)),
     )
-    return Extra(texts={MARKDOWN: board_markdown(board.about, of), LATEX: board_latex(board.about, of)})
+    return AdditionalFiles(texts={MARKDOWN: board_markdown(board.about, of), LATEX: board_latex(board.about, of)})

@@ -14,7 +14,7 @@ aged
 occluded
     The same with more of the view unknown (`unknown_share`, by at least 0.05).
 one of several
-    The answer is wrong and accepted, and nobody could do better: the searched map holds the place several times, so
+    The answer is wrong and accepted, and no answer is better: the searched map holds the place several times, so
     that its ceiling is below 1. The controls and falsifiers of twins are such.
 aliased
     The answer is wrong and accepted, at a place that has a double: alias index at least 0.9, the highest bin of a
@@ -72,7 +72,7 @@ SEVERAL: Final = "one of several"
 FAILURES: Final = (
     *("aliased", "aged", "occluded", "absent accepted", "right but not accepted", SEVERAL, BOTH, "other"),
 )
-MEANINGS: Final = {  # of the classes, for whoever looks at them; above in full
+MEANINGS: Final = {  # of the classes, as pages show them; above in full
     "aliased": "wrong and accepted, where the map has a place much alike",
     "aged": "right on the map of the day, wrong where more of the map has changed",
     "occluded": "right in the open, wrong where more of the view is hidden",
@@ -80,7 +80,7 @@ MEANINGS: Final = {  # of the classes, for whoever looks at them; above in full
     "right but not accepted": "the answer is right, and the rejector refuses it",
     SEVERAL: "wrong and accepted, but the map holds the place several times, and nothing tells which it is",
     BOTH: "as wrong without the stress, which is not to blame",
-    "other": "no right answer, for no reason that is told here",
+    "other": "no right answer, for no reason listed here",
 }
 OPERATING: Final = "accepted_0.05"  # column of judged rows
 COLUMNS: Final = ("query_id", "matcher", "failure", "suite", "region", "kind")

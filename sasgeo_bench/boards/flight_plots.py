@@ -305,8 +305,8 @@ def draw_drift(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         chart.set_ylim(-0.03, 1.04)
         for at, name in enumerate(names):
             line = mine[mine["matcher"] == name].sort_values("drift")
-            aside = 0.06 * (at - (len(names) - 1) / 2)
-            draw_line(chart, line, np.array([bins.index(one) for one in line["drift"]]) + aside, at)
+            offset = 0.06 * (at - (len(names) - 1) / 2)
+            draw_line(chart, line, np.array([bins.index(one) for one in line["drift"]]) + offset, at)
 
 
 def _percent(name: str) -> str:

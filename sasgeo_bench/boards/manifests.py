@@ -124,7 +124,7 @@ SeedVerdict = Literal["run here", "reproduced", "not reproduced"]
 
 
 class SeedResult(Record):
-    """How the answers of an entry fared on a private seed, and why it is said so."""
+    """How the answers of an entry fared on a private seed, and why."""
 
     verdict: SeedVerdict
     why: str
@@ -218,8 +218,8 @@ class MetricRecord(Record):
         least, greatest = ("any" if end is None else f"{end:g}" for end in (self.least, self.greatest))
         unit = "" if self.unit == "1" else f" {self.unit}"
         whose = f"a metric of {self.code} ({self.sha256[:12]}), not of sasgeo-bench"
-        said = f"{self.meaning.removesuffix('.')}. {self.better.capitalize()} is better, {least} to {greatest}{unit}"
-        return f"{said}; {whose}"
+        text = f"{self.meaning.removesuffix('.')}. {self.better.capitalize()} is better, {least} to {greatest}{unit}"
+        return f"{text}; {whose}"
 
 
 class BoardManifest(Record):

@@ -101,7 +101,7 @@ class ContrastSpec(Document):
 
     @model_validator(mode="after")
     def _can_be_judged(self) -> Self:
-        """Refuse a whole area of which nobody knows how much a perfect order has already."""
+        """Refuse a whole area: how much of it a perfect order has already is unknown."""
         if self.metric == "aurc" and (self.pilot is None or None in (self.pilot.second, self.pilot.false_share)):
             raise ValueError(
                 f"contrast {self.name!r} by aurc needs a pilot with second and false_share, from train places: where "
@@ -301,10 +301,10 @@ class PipelineFile(NamedDocument):
     @property
     def sha256(self) -> str:
         """Hash of all that it says of the experiment, defaults among it, as `board.json` names it."""
-        unsaid = {"archive"} | {
+        left_out = {"archive"} | {
             name for name in ("learning", "reference_imagery", "metrics") if not getattr(self, name)
         }
-        fields = self.model_dump(mode="json", exclude=unsaid)
+        fields = self.model_dump(mode="json", exclude=left_out)
         pilots = [item["pilot"] for item in fields["contrast"] if item["pilot"] is not None]
         named = {**fields, "pilot": pilots}
         for name, newer in _NEWER.items():

@@ -30,7 +30,7 @@ from sasgeo_bench.scoring.intervals import effective_count, wilson_share
 from sasgeo_bench.scoring.metrics import TRACKS, primary_of
 from sasgeo_bench.scoring.protection import ProtectionLevels
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, answers_of, mixtures_of
-from sasgeo_bench.scoring.rows import ALL_SUITES, is_apart, is_unranked
+from sasgeo_bench.scoring.rows import ALL_SUITES, is_set_apart, is_unranked
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, primary_rows
 from sasgeo_bench.tasks.query import SEQUENCE
 
@@ -46,7 +46,7 @@ BEYOND_M: Final = 1500.0
 
 def ranked_matchers(table: pd.DataFrame) -> list[str]:
     """Return the matchers that are neither controls nor set apart, in the order of the table."""
-    return [name for name in dict.fromkeys(table.loc[~is_apart(table), "matcher"]) if not is_unranked(name)]
+    return [name for name in dict.fromkeys(table.loc[~is_set_apart(table), "matcher"]) if not is_unranked(name)]
 
 
 def shown_matchers(table: pd.DataFrame, contrasts: Sequence[Contrast]) -> tuple[str, ...]:

@@ -504,7 +504,7 @@ def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -
             "The queries that the first figure of the suite counts. Upright bars: 95 % intervals; level "
             "bars: from the median latency to the 95th percentile, all suites of the track, as measured where each "
             "matcher ran. Grey line: the front, where no other matcher is both faster and better. Controls "
-            "compete with nobody."
+            "do not compete."
         ),
         below="latency of an answer (s), median to 95th percentile",
         rows=down,

@@ -40,7 +40,7 @@ from sasgeo_bench.scoring.intervals import (
 )
 from sasgeo_bench.scoring.metric import MeanMetric
 from sasgeo_bench.scoring.metrics import FALSE_ABSENT, primary_of
-from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE, name_alone
+from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE, base_name
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
 from sasgeo_bench.scoring.strata import GROUP
 from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS
@@ -212,7 +212,7 @@ def check_public(seed: SeedRecord | None, what: str) -> None:
         )
 
 
-def hold_private(
+def score_private(
     request: ScoreRequest,
     *,
     entries: Sequence[Entry],
@@ -283,7 +283,7 @@ def _is_of(scores: pd.DataFrame, named: set[tuple[str, str]]) -> "pd.Series[bool
 
 def _whose(entry: Entry | BoardEntry) -> tuple[str, str | None, str | None]:
     """Return name, version, and hash of code and settings, which identify an entry on both boards."""
-    return (name_alone(entry.name), entry.version, entry.hash)
+    return (base_name(entry.name), entry.version, entry.hash)
 
 
 def _lack(entry: BoardEntry | None, seed: SeedRecord) -> str:

@@ -37,7 +37,7 @@ from sasgeo_bench.scoring.flights import ScoredFlights, score_flights
 from sasgeo_bench.scoring.pose import first_pose
 from sasgeo_bench.scoring.rejection import OWN, judge, own_confidence, rules_of
 from sasgeo_bench.scoring.score import COLUMNS, MISSING, score_task, settle_not_applicable
-from sasgeo_bench.tasks.build import built_anew
+from sasgeo_bench.tasks.build import rebuild_hint
 from sasgeo_bench.tasks.query import REAL, Query, Truth
 from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.sheet import strength_text
@@ -126,7 +126,7 @@ def read_picture(case: Case, task: Task) -> CasePicture:
     region = task.region
     manifest = region_files.read_manifest(region)
     if not task.manifest.is_of_map(manifest):
-        raise StoreError(built_anew(task.manifest.region))
+        raise StoreError(rebuild_hint(task.manifest.region))
     query, truth = case.query, case.truth
     modes = case.prediction.candidates if case.prediction is not None and case.fix is not None else ()
     row, col, rows, cols = window = _window(case, manifest.grid)

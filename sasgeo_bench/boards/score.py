@@ -24,33 +24,33 @@ from sasgeo_bench.boards.manifests import (
     RejectorRecord,
     SeedRecord,
 )
-from sasgeo_bench.boards.private_board import OnPrivate, hold_private, seed_of
+from sasgeo_bench.boards.private_board import OnPrivate, score_private, seed_of
 from sasgeo_bench.boards.scored import Scored, ScoreRequest
 from sasgeo_bench.core.errors import StoreError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.regions.region_files import read_manifest
-from sasgeo_bench.running.failures import Failures, log_beside, stops_all
+from sasgeo_bench.running.failures import Failures, is_disk_error, log_beside
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding, with_causes
-from sasgeo_bench.scoring.contrasts import hold_contrasts
+from sasgeo_bench.scoring.contrasts import evaluate_contrasts
 from sasgeo_bench.scoring.controls import (
     CONTROL_SCHEMA,
     FALSIFIER_SCHEMA,
     Falsifier,
     Verdict,
+    evaluate_controls,
+    evaluate_falsifiers,
     failed_controls,
     gains_without_stress,
-    hold_controls,
-    hold_falsifiers,
 )
 from sasgeo_bench.scoring.cost import COLUMNS as COST_COLUMNS
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.entries import (
-    Contest,
     Entry,
+    ScoredEntries,
     find_entries,
     leave_out,
     open_tasks,
@@ -63,7 +63,7 @@ from sasgeo_bench.scoring.entries import (
 from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metrics, measured
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA, protection_frame
 from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, Rule, evaluate_rejectors, rules_of
-from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, name_alone, with_entry_labels
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, base_name, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION, single_views
 from sasgeo_bench.scoring.tables import cost_figures, leaderboards
 from sasgeo_bench.tasks.query import SEQUENCE, TASK_VERSION, base_of
@@ -84,17 +84,17 @@ def score_board(request: ScoreRequest) -> Scored:
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules, metrics = rules_of(request.rejectors, request.split), find_metrics(request.metrics)
-    failures = Failures(log_beside(request.board), is_told=False)  # reported with the board, or raised
+    failures = Failures(log_beside(request.board), is_reported=False)  # reported with the board, or raised
     ranks = None
     while ranks is None:  # once more for each time that the comparison of entries fails because of some of them
-        contest = _contest(request, failures)
-        controls = hold_controls(contest.scores)
+        contest = _scored_entries(request, failures)
+        controls = evaluate_controls(contest.scores)
         scored = scored_rows(contest, request.split)
         scores = rows_to_rank(scored, request.split)
         entries = [item.entry for item in contest.answers if item.entry.name in scores]
         excluded = set_apart(entries, scores, request.split, controls)
         tasks = tuple(task.manifest for task in contest.tasks)
-        on_private = hold_private(request, entries=entries, scores=scores, tasks=tasks)
+        on_private = score_private(request, entries=entries, scores=scores, tasks=tasks)
         ranks = _ranks(scores, excluded, request.draws, metrics, failures)
     predictions = {item.entry.name: item.predictions for item in contest.answers}
     views = _of_rows(contest.views, scores)
@@ -142,10 +142,10 @@ def score_board(request: ScoreRequest) -> Scored:
     )
 
 
-def _contest(request: ScoreRequest, failures: Failures) -> Contest:
+def _scored_entries(request: ScoreRequest, failures: Failures) -> ScoredEntries:
     """Load the entries that have not failed, and their tasks, and score every answer."""
     entries = leave_out(find_entries(request.predictions, request.submissions, failures=failures), request.without)
-    names = {name for entry in entries for name in (entry.name, name_alone(entry.name))}
+    names = {name for entry in entries for name in (entry.name, base_name(entry.name))}
     failures.found |= {name: why for name, why in request.failed.items() if name not in names}
     folders = [folder for folder in request.tasks if base_of(folder.name) not in request.without]
     answers = read_entry_answers(
@@ -171,7 +171,7 @@ def _ranks(
     try:
         return compare(frames)
     except Exception as error:
-        if stops_all(error) or not failures.blame(frames, compare):
+        if is_disk_error(error) or not failures.blame(frames, compare):
             raise
     tell("scored again without those that failed")
     return None
@@ -220,10 +220,10 @@ def _tested(
     """Return the falsifiers and the registered contrasts; those of a stored board stand as they are."""
     failed, draws = failures.found, request.draws
     held = [item for item in request.contrasts if {item.first, item.second} <= scores.keys() or not failed]
-    falsifiers = hold_falsifiers(held, scores, draws=draws)
+    falsifiers = evaluate_falsifiers(held, scores, draws=draws)
     if request.stored is not None:
         return falsifiers, request.stored.findings
-    findings = hold_contrasts(request.contrasts, scores, rejection.judged, draws=draws, failed=failed)
+    findings = evaluate_contrasts(request.contrasts, scores, rejection.judged, draws=draws, failed=failed)
     return falsifiers, with_causes(findings, gains_without_stress(falsifiers))
 
 

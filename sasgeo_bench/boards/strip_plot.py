@@ -94,7 +94,7 @@ class Strip:
 
 
 def best_on_pictures(scores: Mapping[str, pd.DataFrame], pictured: Collection[tuple[str, str]]) -> str | None:
-    """Return the matcher, controls apart, that finds most queries with pictures; None if nobody was asked any.
+    """Return the matcher, controls apart, that finds most queries with pictures; None if none was asked any.
 
     >>> rows = {"query_id": ["q"], "suite": "aerial", "region": "x", "role": "control", "detector": "rendered"}
     >>> rows |= {"is_present": True, "yaw_error_deg": 0.0}
@@ -108,7 +108,7 @@ def best_on_pictures(scores: Mapping[str, pd.DataFrame], pictured: Collection[tu
 
 
 def pictured_tasks(cases: RunCases) -> tuple[tuple[str, str], ...]:
-    """Return suite and region of the tasks of a run that hold pictures: those of segmenters that are told nothing.
+    """Return suite and region of the tasks of a run that hold pictures: those of segmenters that get nothing else.
 
     Tasks of a control such as `oracle_segmenter` are returned if there are no others.
     """

@@ -25,7 +25,7 @@ Record = Mapping[str, Any]  # a row of the leaderboard
 Key = tuple[str, str, str]  # suite, track, prior group
 
 DAGGER: Final = "†"  # of an interval that Wilson's reaches beyond the draws
-_LEAST_P: Final = 5e-4  # less would read as nought
+_LEAST_P: Final = 5e-4  # a smaller one would look like zero
 _PLAIN: Final = re.compile(r"[^a-z0-9]+")
 _MOST_LETTERS: Final = 60  # of a part of a file name
 
@@ -372,32 +372,32 @@ _UNKNOWN: Final = "no meaning is written down for this column"
 _HEADS: Final = {one.head: one.meaning for schema in SCHEMAS.values() for one in schema.columns if one.head}
 
 
-def _said(*heads: str) -> dict[str, str]:
+def _meanings(*heads: str) -> dict[str, str]:
     """Return what the schemas of tables say of some columns, by the titles of these."""
     return {head: _HEADS[head] for head in heads}
 
 
 _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
-    **_said("matcher"),
+    **_meanings("matcher"),
     "rank": "Ranks that the matcher can have, all pairs compared at once. Matchers that share a rank cannot be "
-    f"distinguished. With fewer than {LEAST_PLACES} places nobody is ranked (-)",
+    f"distinguished. With fewer than {LEAST_PLACES} places no entry is ranked (-)",
     "control": "The same figure at the same places without the stress",
     "false fixes": "Share of absent places that were answered; each such answer is a false fix. Lower is better",
-    **_said("detectable", "n"),
+    **_meanings("detectable", "n"),
     "mean": "Mean of the suites beside it in which somebody is ranked, which weigh alike; of entries that were asked "
     "about all suites",
-    **_said("missing", "blocks", "suite", "part", "kind"),
+    **_meanings("missing", "blocks", "suite", "part", "kind"),
     "risk kept": "Whether at most 5 % of all answers are false: yes or no where the whole interval says so, else open",
-    **_said("rejector", "track", "contrast", "first", "second", "difference"),
+    **_meanings("rejector", "track", "contrast", "first", "second", "difference"),
     "by blocks": "The interval of the difference if blocks, not places, are resampled: of these places alone",
     "by countries": "The interval of the difference if countries are resampled, then places in them",
-    **_said("attainable", "matters", "p (Holm)"),
+    **_meanings("attainable", "matters", "p (Holm)"),
     "discordant": "Queries that only the first got right, and only the second",
-    **_said("verdict", "control query", "outcome", "found", "expected", "p"),
+    **_meanings("verdict", "control query", "outcome", "found", "expected", "p"),
     "fails at": "How many right ones fail the control; never: even if all were right, guessing could have done it",
     "figure": "Success or recall under stress, or false fixes at absent places",
     "public": "The figure on the public seed of this board",
-    "private": "The same on a private seed, whose queries nobody else can draw",
+    "private": "The same on a private seed, whose queries only its holder can draw",
     "private less public": "Difference with its interval; all intervals of a matcher hold at once (95 %)",
     "shown": "Whether the private figure is shown to be worse",
     "class": "Semantic class of the map",
@@ -418,7 +418,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "suites": "Suites that were drawn there",
     "scenes": "Kind of place, as its region file says",
     "kind of place": "Places of one kind, as their region files say; a place with several kinds counts in each",
-    **_said(
+    **_meanings(
         "method",
         "absence",
         "absent",
@@ -454,7 +454,7 @@ RANKS_NOTE: Final = (
 )
 TERMS: Final = {  # what tables show that is no column
     DAGGER: "Wilson's interval: of a few sites, or where all answers are right, draws alone would be too narrow",
-    "-": "nothing to show: no such query, no rank, nobody to compare with",
+    "-": "nothing to show: no such query, no rank, no other to compare with",
     "the prior alone": "what `prior_centre` reaches, which looks at nothing: it answers with the middle of the prior's "
     "disc, or of the map without one; of candidates with the one nearest to the middle of all",
     "the odometer alone": "what `dead_reckoning` reaches: it adds up the odometer's steps from the middle of the prior",
@@ -466,17 +466,17 @@ MARKS: Final[dict[str, str]] = {  # words next to names and ranks
     RUN_HERE: "the matcher's code was run here, on queries of a public seed, which code can draw again",
     REPRODUCED: "it was run on a private seed of 128 bits too, and no figure is shown to be worse there",
     NOT_REPRODUCED: "it was run on a private seed too, and is shown to be worse there: do not trust the row",
-    AS_SUBMITTED: "a file of answers; nobody here has run its code",
+    AS_SUBMITTED: "a file of answers; its code was not run here",
     PACKED: "answers of an archive that lay beside the pipeline file; what is not in it was asked here",
     "trained on": "the places that its parameters come from",
     "set apart": "in a table of its own and in no rank, for the reason stated there",
     FAILED_CONTROL: "it fails a control of the board, whose right score is known beforehand: do not trust the row",
     "tie": "shares ranks with others, who are named below the table; neighbouring ties differ in colour",
 }
-CONTROL: Final = Mark(text="control", meaning="no rival: it shows what a figure means that nobody earned")
+CONTROL: Final = Mark(text="control", meaning="no rival: it is a reference for reading the figures")
 FEW: Final = Mark(
     text="few",
-    meaning=f"fewer than {LEAST_PLACES} places: nobody is ranked, and other places of the kind may well differ",
+    meaning=f"fewer than {LEAST_PLACES} places: no entry is ranked, and other places of the kind may well differ",
     tone="warn",
 )
 _TONES: Final = {RUN_HERE: "plain", REPRODUCED: "good", NOT_REPRODUCED: "warn", AS_SUBMITTED: "warn", PACKED: "warn"}

@@ -321,7 +321,7 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
     ]
     columns = {column.term: column.meaning for table in tables for column in table.columns}
     ours = set(MEANINGS.values())  # which may hold code
-    escaped = {term: said if said in ours else markdown(said) for term, said in columns.items()}
+    escaped = {term: meaning if meaning in ours else markdown(meaning) for term, meaning in columns.items()}
     return "\n".join(
         (
             f"# Board: scorer version {about.scorer_version}, task version {about.task_version}",

@@ -76,7 +76,8 @@ Submissions = Annotated[
 Private = Annotated[
     Path | None,
     typer.Option(
-        help="board of a private seed of the same pipeline, OUT/private/boards/<id>: rows it bears out are reproduced"
+        help="board of a private seed of the same pipeline, OUT/private/boards/<id>: rows that agree are marked as "
+        "reproduced"
     ),
 ]
 BOARD_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
@@ -203,7 +204,7 @@ class LeaderboardOptions(Options):
     pipeline: Annotated[str, typer.Argument(help="id of a shipped pipeline, or a file of your own (*.toml)")]
     matcher: Annotated[
         list[str] | None,
-        typer.Option(help="one more than the file names: a name, or module:Class; may be repeated"),
+        typer.Option(help="in addition to those of the file: a name, or module:Class; may be repeated"),
     ] = None
     extracts: ExtractFolders = None
     region_files: RegionFolders = None
@@ -291,7 +292,7 @@ def check_controls(board: Board) -> None:
 
 
 def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) -> None:
-    """Lay down answers packed beside a pipeline file, or say so; queries of a private seed are nobody else's."""
+    """Lay down answers packed beside a pipeline file, or say so; queries of a private seed are never packed."""
     if options.seed_file:
         return
     if not options.dry_run:

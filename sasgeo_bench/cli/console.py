@@ -47,9 +47,9 @@ errors = _PlainConsole(stderr=True, soft_wrap=True, highlight=False)
 
 @dataclass
 class _Heard:
-    """What the user of this process has heard so far."""
+    """What was printed to the user of this process so far."""
 
-    last_s: float = 0.0  # when the last line was told, if to the log alone
+    last_s: float = 0.0  # when the last line was printed, if to the log alone
     result: str = ""  # last line of a quiet command's result
     counts: progress.Lines | None = None
 
@@ -110,7 +110,7 @@ def note(text: str) -> None:
 def heartbeat() -> Iterator[None]:
     """Say that the program is at work and how far it is, whenever it is silent.
 
-    That is after three seconds if it has said nothing yet, else after fifteen; in a longer silence ever more seldom.
+    That is after three seconds if it has printed nothing yet, else after fifteen; in a longer silence ever more seldom.
     """
     begun_s = _heard.last_s = time.monotonic()
     stop, every_s = Event(), progress.EVERY_S
@@ -125,7 +125,7 @@ def heartbeat() -> Iterator[None]:
 
 @contextmanager
 def _complaining() -> Iterator[None]:
-    """Print an error of a thread, which nobody else would catch, as a line."""
+    """Print an error of a thread, which would not be caught otherwise, as a line."""
     try:
         yield
     except StoreError as error:

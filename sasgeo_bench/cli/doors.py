@@ -199,7 +199,7 @@ def _list_metrics() -> None:
 
 
 def _list_rows(heads: Sequence[str], names: Iterable[str], row: Callable[[str], tuple[str, ...]]) -> None:
-    """Print a row for each name; what another package does not hold is told, and the others are listed all the same."""
+    """Print a row for each name; what another package lacks is reported, and the others are listed all the same."""
     table = Table(*heads, box=None, pad_edge=False)
     for name in names:
         try:
@@ -271,7 +271,7 @@ def check_command(
     failed, kinds = 0, [str(kind)] if kind else _kinds_of(name)
     for found in kinds:
         check = _function(str(_DOORS[found].check))
-        rows: Iterator[Any] = check(name) if found in _IN_PROCESS else check(name, is_shut_in=not trusted)
+        rows: Iterator[Any] = check(name) if found in _IN_PROCESS else check(name, is_sandboxed=not trusted)
         table = Table(
             "check" if len(kinds) == 1 else f"check of a {found}", "outcome", "found", box=None, pad_edge=False
         )

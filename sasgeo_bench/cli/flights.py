@@ -145,7 +145,7 @@ def _show(log: FlightLog, speed_mps: float) -> None:
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
     lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
     say(f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}")
-    for line in (*gaps_of(log.time_s), *log.told):
+    for line in (*gaps_of(log.time_s), *log.notes):
         say(line)
     for name, unit in (("height_m", "m"), ("yaw_deg", "deg"), ("pitch_deg", "deg"), ("roll_deg", "deg")):
         values = getattr(log, name)

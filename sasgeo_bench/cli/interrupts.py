@@ -9,7 +9,7 @@ from typing import Final
 
 EXIT_INTERRUPTED: Final = 128 + signal.SIGINT
 _OTHERS: Final = (signal.SIGTERM, signal.SIGHUP)  # which else end a program without a word, and leave what it began
-_received: list[int] = []  # of these, in this process: whoever catches a KeyboardInterrupt does not tell which it was
+_received: list[int] = []  # of these, in this process: a KeyboardInterrupt does not state which it was
 
 
 @contextmanager

@@ -26,7 +26,7 @@ from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.scoring.rows import name_alone
+from sasgeo_bench.scoring.rows import base_name
 from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.query import BY, SEQUENCE_DIGITS
 from sasgeo_bench.tasks.sheet import flight_panels, panels_of, write_flight_sheet, write_sheet
@@ -55,7 +55,7 @@ class InspectOptions(Options):
         ),
     ] = None
     rejector: Annotated[
-        list[str] | None, typer.Option(help="of a run: what says which answers are accepted; may be repeated")
+        list[str] | None, typer.Option(help="acceptance rule for answers of a run; may be repeated")
     ] = None
     split: Annotated[str, typer.Option(help="of a run: says which places calibrate rejectors")] = "crossfit"
     region_folders: RegionFolders = None
@@ -166,7 +166,7 @@ def _best_run(board: Path, out: Path) -> Path:
             f"{board} holds no answers to queries with pictures: name a board of a suite such as aerial+..."
         )
     entry = next(item for item in about.entries if item.name == name)
-    return out / "runs" / name_alone(entry.name) / str(entry.hash)
+    return out / "runs" / base_name(entry.name) / str(entry.hash)
 
 
 def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | None) -> None:

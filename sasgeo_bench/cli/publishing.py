@@ -145,8 +145,8 @@ def release_command(options: ReleaseOptions) -> None:
     )
     release = make_release(request)
     maps, queries = counted(len(release.maps), "map"), counted(release.queries, "query", "queries")
-    suites_said = counted(len(release.suites), "suite")
-    say(f"{request.into}: {maps}, {queries} of {suites_said}, {release.bytes / 1e6:.1f} MB")
+    suites_text = counted(len(release.suites), "suite")
+    say(f"{request.into}: {maps}, {queries} of {suites_text}, {release.bytes / 1e6:.1f} MB")
 
 
 def _check_flags(options: ReleaseOptions) -> None:

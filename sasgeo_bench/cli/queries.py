@@ -20,7 +20,7 @@ from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
 from sasgeo_bench.tasks.query import PROFILE, Detector, PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import SUITES
 from sasgeo_bench.tasks.suites.base import Choice
-from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
+from sasgeo_bench.tasks.task_plan import Request, TaskRequest, plan_requests, root_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ class QueryOptions(Options):
     ] = None
     split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit"
     n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8
-    seed: Annotated[int | None, typer.Option(min=0, help="public seed, the root of all chance; default: 0")] = None
+    seed: Annotated[int | None, typer.Option(min=0, help="public random seed; default: 0")] = None
     seed_file: SeedFile = None
     prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
         None
@@ -87,7 +87,7 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
     clean on town-grid: at most 4 sites, 112 queries, out/tasks/clean/town-grid
     """
     private = private_seed(options.seed_file, public=options.seed)
-    wanted = Wanted(
+    wanted = TaskRequest(
         suites=tuple(options.suite or SUITES),
         regions=tuple(options.regions or ()),
         split=options.split,

@@ -97,7 +97,7 @@ class RenderOptions(Options):
     family: Annotated[str, typer.Option(help=f"palette: {', '.join(PALETTES)}")] = "calibration"
     season: Annotated[str, typer.Option(help=", ".join(SEASONS))] = "autumn"
     gsd_m: Annotated[float, typer.Option(help="side of a pixel on the ground, metres, 0.25 to 2")] = 0.5
-    seed: Annotated[int, typer.Option(min=0, help="another number draws another look")] = 0
+    seed: Annotated[int, typer.Option(min=0, help="random seed of the rendering")] = 0
     extracts: ExtractFolders = None
     region_files: RegionFolders = None
     out: Out = Path("out")

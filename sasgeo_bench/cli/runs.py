@@ -59,8 +59,8 @@ class RunOptions(Options):
         typer.Option(help="with --train, what is one place; default: the split of the tasks, if it is a shipped one"),
     ] = None
     region_files: RegionFolders = None
-    again: Annotated[list[str] | None, typer.Option(help="ask rows of this status again, as in timeout")] = None
-    trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in; run.json says so")] = False
+    again: Annotated[list[str] | None, typer.Option(help="ask queries with this status again, e.g. timeout")] = None
+    trusted: Annotated[bool, typer.Option("--trusted", help="run without the sandbox; run.json states it")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is left to do, and stop")] = False
     out: Out = Path("out")
 
@@ -111,7 +111,7 @@ def run(options: RunOptions) -> RunReport:
             shard=_shard(options.shard),
             limit=options.limit,
             again=tuple(options.again or ()),
-            is_shut_in=not options.trusted,
+            is_sandboxed=not options.trusted,
             train=tuple(options.train or ()),
             most_trained=options.most_trained,
             split=_split(options.split, options.tasks, options.region_files) if options.train else None,
@@ -150,7 +150,7 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def _split(name: str | None, tasks: Sequence[Path], folders: Sequence[Path] | None) -> Split | None:
-    """The split that is named, or else that of the tasks, with all known regions; None where nobody knows it."""
+    """The split that is named, or else that of the tasks, with all known regions; None where it is unknown."""
     if name is None:
         name = str(Task.open(tasks[0]).manifest.split)
         if name not in list_split_files():
@@ -193,7 +193,7 @@ class ProfileOptions(Options):
     train: Annotated[
         list[Path] | None, typer.Option(help="task folder to learn from, with its truths; may be repeated")
     ] = None
-    trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in")] = False
+    trusted: Annotated[bool, typer.Option("--trusted", help="run without the sandbox")] = False
     into: Annotated[Path | None, typer.Option(help="folder to write; default: OUT/profiles/MATCHER")] = None
     out: Out = Path("out")
 
@@ -209,7 +209,7 @@ def profile_command(options: ProfileOptions) -> None:
         sustain_s=options.seconds,
         radius_m=options.radius,
         train=tuple(options.train or ()),
-        is_shut_in=not options.trusted,
+        is_sandboxed=not options.trusted,
     )
     plan = plan_profile(request)
     folder = options.into or options.out / "profiles" / plan.card.name

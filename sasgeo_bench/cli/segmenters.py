@@ -33,7 +33,7 @@ class SegmentOptions(Options):
     most_trained: Annotated[int, typer.Option(min=1, help="pictures to learn from at most, evenly over places")] = 80
     segment_s: Annotated[float, typer.Option(help="seconds for one picture")] = Limits().match_s
     learn_s: Annotated[float, typer.Option(help="seconds to learn")] = Limits().learn_s
-    trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the segmenter in")] = False
+    trusted: Annotated[bool, typer.Option("--trusted", help="run without the sandbox")] = False
     region_files: RegionFolders = None
     jobs: Annotated[int, typer.Option(min=1, help="tasks at once")] = 1
     out: Out = Path("out")
@@ -70,7 +70,7 @@ def segment(options: SegmentOptions) -> tuple[Path, ...]:
             is_recalibrated=options.recalibrated,
             most=options.most_trained,
             limits=Limits(match_s=options.segment_s, learn_s=options.learn_s),
-            is_shut_in=not options.trusted,
+            is_sandboxed=not options.trusted,
             jobs=options.jobs,
         ),
     )

@@ -18,7 +18,7 @@ from sasgeo_bench.exchange.submissions import hold_submission
 from sasgeo_bench.regions.region_files import differing_files, read_features
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running.prediction_files import Violation, parts_of
-from sasgeo_bench.scoring.submission_files import is_submission, set_aside, validate
+from sasgeo_bench.scoring.submission_files import count_excluded, is_submission, validate
 from sasgeo_bench.tasks.build import check_task
 from sasgeo_bench.tasks.duplicates import constellations, search_split
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
@@ -81,8 +81,8 @@ def _verify_answers(predictions: Path, tasks: list[Path]) -> None:
     with laid_tasks(tasks) as folders:
         asked = [Task.open(folder) for folder in folders]
         _show(validate(predictions, asked), predictions)
-        aside = set_aside(predictions, asked)
-    rest = f"{counted(aside, 'answer')} to other queries set aside" if aside else "and nothing else"
+        excluded = count_excluded(predictions, asked)
+    rest = f"{counted(excluded, 'answer')} to other queries set aside" if excluded else "and nothing else"
     say(f"{predictions}: answers every query of {counted(len(folders), 'task')}, {rest}")
 
 

@@ -237,7 +237,7 @@ def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
 
 
 def _text_of(path: Path) -> str:
-    """Read a file; raise `OSError` for a pipe, which would be waited for, and for what nobody writes by hand."""
+    """Read a file; raise `OSError` for a pipe, which would be waited for, and for what is not written by hand."""
     about = path.stat()
     if not stat.S_ISREG(about.st_mode):
         raise OSError(errno.EINVAL, "it is no plain file", str(path))

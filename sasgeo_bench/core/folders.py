@@ -105,7 +105,7 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             lock.acquire(timeout=0)
         except Timeout:
-            check_room(folder)  # where no file can be made, nobody holds it
+            check_room(folder)  # where no file can be made, it is not locked
             tell(f"{folder} is being written by another run, waiting for it")
             lock.acquire()
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
@@ -248,7 +248,7 @@ def absolute(path: Path) -> Path:
 def _walk(folder: Path, without: Collection[str]) -> Iterator[tuple[str, Path]]:
     """Yield everything below a folder except folders, by relative path; links are not followed."""
 
-    # Raise `StoreError` for a folder that cannot be looked into: nobody knows what it holds.
+    # Raise `StoreError` for a folder that cannot be looked into: its content is unknown.
     def refuse(error: OSError) -> None:
         """Name the folder; of what is not there, or no folder, the caller speaks."""
         if isinstance(error, FileNotFoundError | NotADirectoryError):
@@ -363,7 +363,7 @@ def check_room(folder: Path) -> None:
 
 
 PREFIX: Final = "sasgeo-scratch-"
-_NEW: Final = ".sasgeo-new-"  # until it is locked: nobody sweeps a folder of this name
+_NEW: Final = ".sasgeo-new-"  # until it is locked: no process sweeps a folder of this name
 
 
 @contextmanager

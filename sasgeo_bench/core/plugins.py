@@ -379,9 +379,9 @@ def check_own_name(spec: str, name: object, group: str, *, shipped: Collection[s
     `where` is what says the name.
     """
     if not isinstance(name, str) or not NAME.fullmatch(name):
-        said = one_line(repr(name))
+        quoted = one_line(repr(name))
         raise MatchError(
-            f"{spec}: {where} is named {said}: lower-case letters, digits, - and _ make a name, 60 at most"
+            f"{spec}: {where} is named {quoted}: lower-case letters, digits, - and _ make a name, 60 at most"
         )
     if name in shipped:
         raise MatchError(f"{spec}: {where} is named {name!r}, as a {KINDS[group]} that ships: rename it")
@@ -531,7 +531,7 @@ def file_digest(path: Path) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _Code:
-    """What is told of a file: its SHA-256, and the modules that it imports."""
+    """What is known of a file: its SHA-256, and the modules that it imports."""
 
     digest: bytes
     imports: frozenset[str] = frozenset()
@@ -587,18 +587,18 @@ def _tree(data: bytes) -> ast.Module | None:
 
 def _shape(tree: ast.AST) -> str:
     """Return what a syntax tree says: types, fields and values, without docstrings, and what is empty or no code."""
-    said: list[str] = []
-    left: list[Any] = [tree]  # what is still to be said, last first: trees and lists, or how the rest is said
+    parts: list[str] = []
+    left: list[Any] = [tree]  # what is still to be written, last first: trees and lists, or how the rest is written
     while left:
         item = left.pop()
         if isinstance(item, str):
-            said.append(item)
+            parts.append(item)
         elif isinstance(item, list):
-            said.append("[")
+            parts.append("[")
             left.append("]")
             left += [_part(one) for one in reversed(item)]
         else:
-            said.append(f"{type(item).__name__}(")
+            parts.append(f"{type(item).__name__}(")
             left.append(")")
             for field in reversed(item._fields):
                 value = getattr(item, field, None)
@@ -612,7 +612,7 @@ def _shape(tree: ast.AST) -> str:
                 if field == "body" and isinstance(value, list) and _has_docstring(item):
                     value = value[1:]
                 left += [_part(value), f"{field}="]
-    return "".join(said)
+    return "".join(parts)
 
 
 def _part(value: object) -> object:

@@ -127,11 +127,11 @@ class _Outlet:
     progress: Progress = field(default_factory=lambda: Lines(silent))
 
 
-_outlet = _Outlet()  # of the process, not of a thread or context: whoever works for a command reports to its user
+_outlet = _Outlet()  # of the process, not of a thread or context: all that works for a command reports to its user
 
 
 def tell(line: str) -> None:
-    """Report one line on the work to whoever listens: the user of a command, nobody in a program by default."""
+    """Report one line on the work to the listener: the user of a command, none in a program by default."""
     _outlet.tell(line)
 
 
@@ -165,16 +165,16 @@ def reporting(tell: Tell | None = None, progress: Progress | None = None) -> Ite
 
 
 def reported(work: Callable[[Item], Found]) -> Callable[[Item], Found]:
-    """Return work for `spread` that reports to whoever listens here from another process, too.
+    """Return work for `spread` that reports to the listener of this process from another one, too.
 
-    A function that other processes can import is told each line at once, anything else when the item is done.
+    A function that other processes can import gets each line at once, anything else when the item is done.
     """
     named = isinstance(_outlet.tell, FunctionType) and "<" not in _outlet.tell.__qualname__
     return partial(_reported, work, _outlet.tell if named else None, _here())
 
 
 class _Reported(NamedTuple, Generic[Found]):
-    """A result, and what was told on the way."""
+    """A result, and the lines of its work."""
 
     lines: list[str]
     found: Found

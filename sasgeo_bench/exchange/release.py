@@ -44,7 +44,7 @@ from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.layers import cog_faults
 from sasgeo_bench.regions.region import LICENCE, Manifest
 from sasgeo_bench.regions.region_spec import find_region_file
-from sasgeo_bench.tasks.build import built_anew, is_of_region
+from sasgeo_bench.tasks.build import is_of_region, rebuild_hint
 from sasgeo_bench.tasks.private_seed import LEAST_BITS
 from sasgeo_bench.tasks.query import CONTROLS
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, read_split_file
@@ -248,7 +248,7 @@ def _check_task(task: Task, manifest: Manifest, split: SplitFile) -> None:
     about = task.manifest
     check_public(seed_of([about]), str(task.folder))
     if not about.is_of_map(manifest):
-        raise StoreError(built_anew(about.region))
+        raise StoreError(rebuild_hint(about.region))
     if about.split != split.id and about.suite != CONTROLS:  # controls of every board have a split of theirs
         raise StoreError(
             f"{task.folder} was drawn by split {about.split!r}, not by {split.id!r}: name it with --split, "

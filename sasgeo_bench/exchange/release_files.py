@@ -66,7 +66,7 @@ licence.
 _IMAGERY: Final = """\
 # Imagery
 
-Each file has the licence of the pictures that it was cut out of; whoever passes it on names their authors where readers
+Each file has the licence of the pictures that it was cut out of; who passes it on names their authors where readers
 see it. Photographs are not derived from OpenStreetMap, and not under the ODbL. What is rendered from a map is, and its
 source says so. All other files are as the notice says.
 
@@ -174,7 +174,7 @@ class Release:
         return f"{DATA_VERSION}.{TASK_VERSION}.0"
 
     @property
-    def truths_said(self) -> str:
+    def truths_text(self) -> str:
         """Return which truths are in the release."""
         if self.board is not None:
             return f"in the stored results of the board {self.board}"
@@ -404,7 +404,7 @@ def write_index(folder: Path, release: Release) -> None:
         "places": [place.model_dump(mode="json", exclude_defaults=True) for place in places_of(release)],
         "maps": [map_record(item) for item in release.maps],
         "tasks": [_task_record(task) for task in release.tasks],
-        "truths": release.truths_said,
+        "truths": release.truths_text,
         "licence_url": LICENCE_URL,
     }
     _write_json(folder / INDEX, content)

@@ -569,7 +569,7 @@ def _imagery_line(release: Release) -> str:
 
 def _truth_line(release: Release) -> str:
     if release.board is not None:
-        return f"none here; they are {release.truths_said}"
+        return f"none here; they are {release.truths_text}"
     if release.with_truth:
         return "all are in this release"
     released = sorted({part for task in release.tasks for part in task.released})

@@ -25,7 +25,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import RUN, RunManifest, Violation
 from sasgeo_bench.scoring.entries import check_name
 from sasgeo_bench.scoring.rejection import rules_of
-from sasgeo_bench.scoring.rows import name_alone
+from sasgeo_bench.scoring.rows import base_name
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.submission_files import (
     is_submission,
@@ -121,7 +121,7 @@ def _split_of(name: str | None) -> Split | None:
 
 def _names_on(settings: PackManifest) -> set[str]:
     """Return the names of the matchers on a board, without their versions."""
-    return {name_alone(name) for name in settings.contestants}
+    return {base_name(name) for name in settings.contestants}
 
 
 def _check_places(card: Card, board: Path, split: Split | None, source: str) -> None:
@@ -311,7 +311,7 @@ def why_anew(about: BoardManifest, cards: Sequence[RejectorCard]) -> str | None:
     """Return why the figures of a stored board are no longer those of this program, None if they are.
 
     `about` is its manifest, `cards` those of the rejectors here. The version of tasks does not matter:
-    answers are scored against the stored queries, whoever draws which others today.
+    answers are scored against the stored queries, whichever others are drawn today.
 
     >>> why_anew(BoardManifest(scorer_version=1, entries=[], tasks=[]), [])
     'the board is of scorer version 1, this program of 6'

@@ -72,7 +72,7 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = ()) -> Pipeli
     _check_version(stored)
     made_by = read_pack(stored).pipeline
     if made_by is None:
-        raise ConfigError(f"{stored} are stored results of no pipeline, so nobody knows how its queries are drawn")
+        raise ConfigError(f"{stored} are stored results of no pipeline, so how its queries are drawn is unknown")
     spec = read_pipeline_file(request.pipeline or find_pipeline_file(made_by.id))
     if spec.identity != made_by:
         raise ConfigError(

@@ -35,7 +35,7 @@ from sasgeo_bench.tasks.split import HALVES, Split
 _WITHOUT: Final = "; or leave their regions out by --without, which counts as misses"
 _LIKE: Final = 0.7  # names that are more alike are taken for a slip of the pen
 _LONGEST_MESSAGE: Final = 120  # characters of an example
-_MOST_KINDS: Final = 5  # of errors that are told
+_MOST_KINDS: Final = 5  # of errors that are shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,8 +169,8 @@ def _changed(plan: RunPlan) -> Iterator[str]:
 def failure_lines(predictions: Iterable[Prediction]) -> Iterator[str]:
     """Yield how many queries ended in each way but a sound one, with the first message of each kind of error.
 
-    >>> said = ["ValueError: no road", "ValueError: no sea", "KeyError: 'x'"]
-    >>> lost = [Prediction(query_id=one, status="crash", message=one, candidates=()) for one in said]
+    >>> messages = ["ValueError: no road", "ValueError: no sea", "KeyError: 'x'"]
+    >>> lost = [Prediction(query_id=one, status="crash", message=one, candidates=()) for one in messages]
     >>> for line in failure_lines(lost):
     ...     print(line)
     2 ended as crash, the first with the message 'ValueError: no road'

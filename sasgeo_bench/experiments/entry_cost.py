@@ -121,8 +121,8 @@ def cost_lines(
         jobs = 1 if line.startswith("scoring") else plan.jobs
         spans.append(Span(least_s / jobs, busy * most_s / jobs))
         yield f"  {line.format(spans[-1].to_text())}"
-    told = f": the longer on this machine, with {load:.1f} processes at work on {counted(processors, 'processor')}"
-    yield f"  in all {Span(*map(sum, zip(*spans, strict=True))).to_text()}{told if busy > 1 else ''}"
+    note = f": the longer on this machine, with {load:.1f} processes at work on {counted(processors, 'processor')}"
+    yield f"  in all {Span(*map(sum, zip(*spans, strict=True))).to_text()}{note if busy > 1 else ''}"
     if run is not None and run.learns:
         yield "  what it learns before comes on top"
 

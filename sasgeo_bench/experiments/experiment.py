@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
-from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.boards.board_files import AdditionalFiles
 from sasgeo_bench.boards.pipeline_spec import PaperSpec, PipelineFile
 from sasgeo_bench.boards.scored import Scored
 from sasgeo_bench.core.errors import ConfigError
@@ -26,7 +26,7 @@ class Experiment(Protocol):
     def draw(self, spec: PaperSpec, *, out: Path, private: PrivateSeed | None) -> list[Path]:
         """Draw what is not up to date, and return the folders of all tasks."""
 
-    def extra(self, board: Scored, *, root: Path) -> Extra:
+    def extra(self, board: Scored, *, root: Path) -> AdditionalFiles:
         """Return more tables, texts and figures of a board; `root` holds tasks/, truth/ and regions/."""
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A head start: answers to what a pipeline asks first lie packed beside its file, and are unpacked once.
 
-An archive comes from whoever made it. So it holds answers alone, never maps, queries, truths or what was learned: these
+An archive may come from anybody. So it holds answers alone, never maps, queries, truths or what was learned: these
 are made here, and an answer to another query than is drawn here counts for nothing. A pipeline file states the SHA-256
 of its archive. What is unpacked is marked for good (`prediction_files.PACKED`), so that no board says "run here" of it.
 """
@@ -82,7 +82,7 @@ def unpack_head_start(pipeline_file: Path, stated: ArchiveSpec | None, out: Path
     data = _read(archive, stated.sha256, pipeline_file)
     try:
         with locked(out / "head-start"):
-            for left in out.glob(f"{_SCRATCH}*"):  # of a run that was killed: nobody else unpacks now
+            for left in out.glob(f"{_SCRATCH}*"):  # of a run that was killed: no other process unpacks now
                 remove_tree(left)
             with TemporaryDirectory(prefix=_SCRATCH, dir=out) as folder:
                 _unpack(archive, data, Path(folder))

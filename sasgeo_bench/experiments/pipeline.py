@@ -45,7 +45,7 @@ from sasgeo_bench.tasks.split import HALVES, Split
 from sasgeo_bench.tasks.suites.all_suites import find_suite, is_pictured, known_suite
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_files import Task
-from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
+from sasgeo_bench.tasks.task_plan import Request, TaskRequest, plan_requests, root_of
 
 HELD_OUT: Final = "held out"
 _NOT_TRAINED: Final = ("calibration", "test")
@@ -123,7 +123,7 @@ class TrainingGroups:
         there = {place for item in requests for place in self.split.places_in(item.region.id)}
         for half, other in () if is_holdout(self.split) else (HALVES, HALVES[::-1]):
             if not any(self.split.half_of.get(place) == half for place in there):
-                lines.append(f"    half {half} has no place here: nobody learns for half {other}")
+                lines.append(f"    half {half} has no place here: none learns for half {other}")
         if self.learning.oracles:
             lines.append(f"    {', '.join(self.learning.oracles)}: from {own}, never ranked")
         return lines
@@ -256,10 +256,10 @@ class PipelinePlan:
 
     def _imagery_lines(self) -> list[str]:
         """Report what imagery is rendered."""
-        said = self.spec.reference_imagery
-        if said is None:
+        settings = self.spec.reference_imagery
+        if settings is None:
             return []
-        look = f"{said.season}, family {said.family}, seed {said.seed}, {said.age_years:g} years older"
+        look = f"{settings.season}, family {settings.family}, seed {settings.seed}, {settings.age_years:g} years older"
         return [f"  reference imagery: {counted(len(self.imaged), 'region')}, rendered ({look})"]
 
     @property
@@ -303,8 +303,8 @@ def _most(lacking: Sequence[_Lacking]) -> str:
     """Return how many queries and flights some tasks have at most, in words."""
     flights = sum(item.most for item in lacking if _is_of_flights(item.suite))
     queries = sum(item.most for item in lacking) - flights
-    said = [counted(queries, "query", "queries")] if queries or not flights else []
-    return " and ".join([*said, *([counted(flights, "flight")] if flights else [])])
+    parts = [counted(queries, "query", "queries")] if queries or not flights else []
+    return " and ".join([*parts, *([counted(flights, "flight")] if flights else [])])
 
 
 def _stage(name: str, requests: Sequence[Request]) -> _Stage:
@@ -410,7 +410,7 @@ def plan_pipeline(
     out, seed = root_of(out, private), private or spec.seed
     requests: list[Request] = []
     for number, task in enumerate(spec.task):
-        asked = Wanted(
+        asked = TaskRequest(
             suites=tuple(task.suites),
             regions=tuple(task.regions or spec.regions),
             split=str(spec.split),  # a file with tasks names one
@@ -535,7 +535,7 @@ def _plan_controls(seed: Seed, out: Path, split: Split | None) -> tuple[Request,
         raise ConfigError(
             f"split {split.spec.id!r} trains on every embedded town or seals it, and controls need one: free one"
         )
-    controls = Wanted(
+    controls = TaskRequest(
         suites=(CONTROLS,),
         regions=tuple(regions),
         split=CONTROL_SPLIT,
@@ -784,14 +784,14 @@ def _draw(requests: Sequence[Request], *, jobs: int) -> list[Path]:
 
 def _render(plan: PipelinePlan) -> None:
     """Render the reference imagery of the file, unless it is up to date."""
-    said = plan.spec.reference_imagery
-    if said is None:
+    settings = plan.spec.reference_imagery
+    if settings is None:
         return
     for request in plan.imaged:
-        date = said.date_of({item.date for item in request.region.extract})
+        date = settings.date_of({item.date for item in request.region.extract})
         render_place(
             request.region,
-            look=said.look,
+            look=settings.look,
             date=date,
             out=plan.out,
             extract_folders=request.extract_folders,

@@ -265,7 +265,7 @@ def _length_rows(
             drawn = np.array(means)[rng.integers(len(means), size=(draws, len(means)))].mean(axis=1)
             rest = (1 - LEVEL) / 2
             ends = np.array([np.mean(means), *np.quantile(drawn, [rest, 1 - rest])])
-            ends[1:] += 0.0 if len(means) > 1 else math.nan  # of one sequence nobody knows how much they differ
+            ends[1:] += 0.0 if len(means) > 1 else math.nan  # one sequence does not show how much they differ
             row |= dict(zip(("value", "lo", "hi"), (np.sqrt(ends) if rms else ends).tolist(), strict=True))
         yield row
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Columns of tables with latitude and longitude: formats that are told by their names, and any other table.
+"""Columns of tables with latitude and longitude: formats that are recognized by their names, and any other table.
 
 A name is compared in small letters, its words joined by "_", with and without its topic ("GPS." of "GPS.Lat"). Where
 the units of a format come from: the table in `docs/concepts/flights.md`.
@@ -89,7 +89,7 @@ _OF_GPS: Final = frozenset({"status", "gms", "gwk", "n_sats", "nsats", "hdop", "
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Format:
-    """A format that is told by names of columns.
+    """A format that is recognized by names of columns.
 
     Parameters
     ----------
@@ -274,13 +274,13 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
     short = [key_of(name.rpartition(".")[2]) for name in header]
     keys = [(short[at], key_of(name)) for at, name in enumerate(header)]
     names = {key for both in keys for key in both} | {name.rpartition(".")[2].strip() for name in header}
-    told = next((one for one in FORMATS if any(sign <= names for sign in one.signs)), _ANY)
+    log_format = next((one for one in FORMATS if any(sign <= names for sign in one.signs)), _ANY)
     found: dict[str, Column] = {}
     part: Column | None = None
     for name in NAMES:
-        matches = list(_matches(name, header, keys, told))
+        matches = list(_matches(name, header, keys, log_format))
         if name == "time":
-            part = _part(header, short, matches, told)
+            part = _part(header, short, matches, log_format)
             matches = [column for column in matches if part is None or column.at != part.at]
         # Of several messages, that of the places, or of the vehicle.
         for topic in (_topic(found["latitude"]), "") if "latitude" in found else ():
@@ -292,27 +292,27 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
             )
         if matches:
             found[name] = matches[0]
-    _check_meaning(source, header, short, told, found, facts)
+    _check_meaning(source, header, short, log_format, found, facts)
     lacking = [name for name in ("latitude", "longitude") if name not in found]
     if lacking:
         raise source.fault(
             f"no column of {' and '.join(lacking)}, found {listed(header) if header else 'none'}: name "
             "them lat_deg and lon_deg"
         )
-    fix = next((name for name in told.fix if name in names), "")
+    fix = next((name for name in log_format.fix if name in names), "")
     topic = _topic(found["latitude"])
-    if told.no_yaw == 0 and "yaw" in found and not _is_yaw_of_gps(found["yaw"], short):
-        told = replace(told, no_yaw=None)
+    if log_format.no_yaw == 0 and "yaw" in found and not _is_yaw_of_gps(found["yaw"], short):
+        log_format = replace(log_format, no_yaw=None)
     layout = Layout(
-        format=told,
+        format=log_format,
         keys=tuple(short),
         fields={name: column for name, column in found.items() if facts.unit(QUANTITIES[name]) != "none"},
         date=_named(header, keys, _DATES),
-        hemispheres=_hemispheres(header, short, told),
+        hemispheres=_hemispheres(header, short, log_format),
         part=part if facts.time_unit != "none" else None,
-        receiver=_receiver(header, keys, told, topic),
+        receiver=_receiver(header, keys, log_format, topic),
         fix=_named(header, keys, (fix,)),
-        least_fix=told.fix.get(fix, 0.0),
+        least_fix=log_format.fix.get(fix, 0.0),
     )
     if "time" not in found and facts.time_unit != "none":
         _check_no_time(source, header, keys, layout)
@@ -323,7 +323,7 @@ def _check_meaning(
     source: LogSource,
     header: Sequence[str],
     short: Sequence[str],
-    told: Format,
+    log_format: Format,
     found: Mapping[str, Column],
     facts: LogFacts,
 ) -> None:
@@ -334,7 +334,7 @@ def _check_meaning(
         raise source.fault(
             f"the time is in parts, columns {names}: join them, as in 10:02:03.5, or say --time-unit none"
         )
-    if "height" not in found or "height" in told.columns or facts.height_unit == "none":
+    if "height" not in found or "height" in log_format.columns or facts.height_unit == "none":
         return
     height = found["height"]
     beside = next((header[at] for at, key in enumerate(short) if _GEODETIC.fullmatch(key)), "")
@@ -345,31 +345,33 @@ def _check_meaning(
         )
 
 
-def _receiver(header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format, topic: str | None) -> Column | None:
-    if told.receiver:
-        return _named([name if _topic_of(name) == topic else "" for name in header], keys, (told.receiver,))
+def _receiver(
+    header: Sequence[str], keys: Sequence[tuple[str, str]], log_format: Format, topic: str | None
+) -> Column | None:
+    if log_format.receiver:
+        return _named([name if _topic_of(name) == topic else "" for name in header], keys, (log_format.receiver,))
     names = [name if _topic_of(name) in (topic, "") else "" for name in header]
     found = (_named(names, keys, (name,)) for name in _RECEIVERS)
     return next((column for column in found if column is not None), None)
 
 
-def _hemispheres(header: Sequence[str], short: Sequence[str], told: Format) -> dict[str, Column]:
+def _hemispheres(header: Sequence[str], short: Sequence[str], log_format: Format) -> dict[str, Column]:
     """Return the columns of N or S, and of E or W; NS of RTKLIB counts satellites."""
     found = {}
     for name, pattern in _HEMISPHERES.items():
         places = [at for at, key in enumerate(short) if pattern.fullmatch(key)]
-        if places and told.name != "RTKLIB":
+        if places and log_format.name != "RTKLIB":
             found[name] = Column(at=places[0], name=header[places[0]])
     return found
 
 
-def _part(header: Sequence[str], short: Sequence[str], times: Sequence[Column], told: Format) -> Column | None:
+def _part(header: Sequence[str], short: Sequence[str], times: Sequence[Column], log_format: Format) -> Column | None:
     """Return the column of parts of a second that goes with a column of seconds, or of dates and clocks."""
     whole = next((column for column in times if column.unit in ("s", None)), None)
     if whole is None:
         return None
     # NS beside EW is a hemisphere, and counts satellites for RTKLIB.
-    is_no_time = told.name == "RTKLIB" or any(_HEMISPHERES["longitude"].fullmatch(key) for key in short)
+    is_no_time = log_format.name == "RTKLIB" or any(_HEMISPHERES["longitude"].fullmatch(key) for key in short)
     base = _words_of(short[whole.at], WORDS["time"])[0]
     for at, key in enumerate(short):
         start, word = _words_of(key, _PARTS)
@@ -415,12 +417,12 @@ def unread(header: Sequence[str], layout: Layout, read: Collection[str], *, has_
     return (f"not read: {listed([header[at] for at in left])}{why}",) if left else ()
 
 
-def _matches(name: str, header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format) -> list[Column]:
+def _matches(name: str, header: Sequence[str], keys: Sequence[tuple[str, str]], log_format: Format) -> list[Column]:
     """Return the columns of a field: by the format, else by its names, of which those with a unit go first."""
     if QUANTITIES[name] == "angle":
         keys = [("", "") if _CARRIED.search(_topic_of(header[at])) else both for at, both in enumerate(keys)]
-    if name in told.columns:
-        found = ((key, unit) for key, unit in told.columns[name].items() if any(key in both for both in keys))
+    if name in log_format.columns:
+        found = ((key, unit) for key, unit in log_format.columns[name].items() if any(key in both for both in keys))
         best, unit = next(found, ("", None))
         return [Column(at=at, name=header[at], unit=unit) for at, both in enumerate(keys) if best and best in both]
     matches = []

@@ -106,7 +106,7 @@ class FlightLog:
         Height above the ground or the place of take-off, metres; never one above the sea.
     yaw_deg, pitch_deg, roll_deg : ndarray, shape (N,), optional
         Attitude of the body, degrees, yaw from true north; in the order of angles of `sensing.camera.Attitude`.
-    told : tuple of str
+    notes : tuple of str
         What was read of which column of a table, in which unit; and what of the file was not read.
     """
 
@@ -117,7 +117,7 @@ class FlightLog:
     yaw_deg: Floats | None = None
     pitch_deg: Floats | None = None
     roll_deg: Floats | None = None
-    told: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -126,7 +126,7 @@ class FlightLog:
         numbers: Sequence[int],
         columns: Mapping[str, Floats],
         *,
-        told: tuple[str, ...] = (),
+        notes: tuple[str, ...] = (),
         names: Mapping[str, str] = MappingProxyType({}),
     ) -> Self:
         """Return a log of checked columns; `numbers` are the lines or points in the file, for messages.
@@ -164,7 +164,7 @@ class FlightLog:
             lon_deg=columns["lon_deg"],
             lat_deg=columns["lat_deg"],
             **{name: columns.get(name) for name in ("time_s", "height_m", *_ANGLES)},
-            told=told,
+            notes=notes,
         )
 
     def __len__(self) -> int:
@@ -276,8 +276,8 @@ class _Track:
             columns["time_s"] = (np.array(self.moments) - self.moments[0]).round(6)
         if self.heights_m:
             columns["height_m"] = np.array(self.heights_m)
-        told = (f"not read: {', '.join(self.unread)}",) if self.unread else ()
-        return FlightLog.of(self.source, range(1, count + 1), columns, told=told)
+        notes = (f"not read: {', '.join(self.unread)}",) if self.unread else ()
+        return FlightLog.of(self.source, range(1, count + 1), columns, notes=notes)
 
     def leave(self, what: str) -> None:
         """Note what is not read, once."""

@@ -263,15 +263,15 @@ def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
     layout = layout if table.has_dates else _as_px4(layout, values)
     numbers, values = _known(source, layout.format, numbers, values)
     values = _with_parts(source, layout, values, in_seconds=table.has_dates or facts.time_unit == "s")
-    columns, told = _converted(source, layout, facts, values, has_dates=table.has_dates)
+    columns, notes = _converted(source, layout, facts, values, has_dates=table.has_dates)
     if not layout.format.is_sorted and "time_s" in columns:
         order = np.argsort(columns["time_s"], kind="stable")
         numbers, columns = numbers[order], {name: column[order] for name, column in columns.items()}
         columns["time_s"] = columns["time_s"] - columns["time_s"][:1]
-    lines_of = {line.partition(":")[0]: line.replace(": ", ", column ", 1) + "," for line in told}
+    lines_of = {line.partition(":")[0]: line.replace(": ", ", column ", 1) + "," for line in notes}
     names = {{"height": "height_m"}.get(name, f"{name}_deg"): line for name, line in lines_of.items()}
-    told += unread(lines.header, layout, values, has_dates=table.has_dates)
-    return FlightLog.of(source, numbers.tolist(), columns, told=told, names=names)
+    notes += unread(lines.header, layout, values, has_dates=table.has_dates)
+    return FlightLog.of(source, numbers.tolist(), columns, notes=notes, names=names)
 
 
 # Values
@@ -469,11 +469,11 @@ def _is_count(values: dict[str, Floats]) -> bool:
 
 
 def _known(
-    source: LogSource, told: Format, numbers: NDArray[np.int64], values: dict[str, Floats]
+    source: LogSource, log_format: Format, numbers: NDArray[np.int64], values: dict[str, Floats]
 ) -> tuple[NDArray[np.int64], dict[str, Floats]]:
     """Return points of which all is known: a column that says nothing is left out, else the points without a value."""
-    if told.no_yaw is not None and "yaw" in values:
-        values["yaw"] = np.where(values["yaw"] == told.no_yaw, np.nan, values["yaw"])
+    if log_format.no_yaw is not None and "yaw" in values:
+        values["yaw"] = np.where(values["yaw"] == log_format.no_yaw, np.nan, values["yaw"])
     for name in _MAY_LACK:
         if name in ("pitch", "roll") and "yaw" not in values:
             values.pop(name, None)  # no attitude without a heading
@@ -496,14 +496,14 @@ def _converted(
 ) -> tuple[dict[str, Floats], tuple[str, ...]]:
     """Return the columns of a log in seconds, metres and degrees, and a line on each."""
     counts = layout.format.counts and _is_count(values)
-    columns, told = {}, []
+    columns, notes = {}, []
     for name, column in values.items():
         quantity = QUANTITIES[name]
         at = layout.fields[name]
         if name == "time" and has_dates:
-            _check_said(source, at, "dates", facts.time_unit, "time")
+            _check_stated_unit(source, at, "dates", facts.time_unit, "time")
             columns["time_s"] = (column - column[:1]).round(6)
-            told.append(f"time: {shown(at.name)}, as dates or clocks have it")
+            notes.append(f"time: {shown(at.name)}, as dates or clocks have it")
             continue
         if quantity == "place":
             unit = _place_unit(source, at, facts, values, counts=counts)
@@ -523,12 +523,12 @@ def _converted(
         else:
             base = column - column[:1] if name == "time" else column
             columns[{"time": "time_s", "height": "height_m"}.get(name, f"{name}_deg")] = base * factor
-        told.append(f"{name}: {shown(at.name)}, {unit}" + (f" ({layout.format.name})" if layout.format.name else ""))
-    return columns, tuple(told)
+        notes.append(f"{name}: {shown(at.name)}, {unit}" + (f" ({layout.format.name})" if layout.format.name else ""))
+    return columns, tuple(notes)
 
 
 def _place_unit(source: LogSource, at: Column, facts: LogFacts, values: dict[str, Floats], *, counts: bool) -> str:
-    """Return the unit of places: degrees, unless the format counts or it is said."""
+    """Return the unit of places: degrees, unless the format counts or they are stated."""
     if at.unit is None and facts.place_unit is None:
         if counts:
             return "e7"
@@ -542,20 +542,20 @@ def _place_unit(source: LogSource, at: Column, facts: LogFacts, values: dict[str
 
 def _unit(source: LogSource, at: Column, quantity: str, facts: LogFacts) -> str:
     """Return the unit that a name, a format or the user states; raise `FlightError` if none does, or both differ."""
-    said = facts.unit(quantity)
+    stated = facts.unit(quantity)
     if at.unit is not None:
-        _check_said(source, at, at.unit, said, quantity)
+        _check_stated_unit(source, at, at.unit, stated, quantity)
         return at.unit
-    if said is None:
+    if stated is None:
         choices = choices_of(quantity)
-        said = f"{', '.join(choices[:-1])} or {choices[-1]}"
+        listed = f"{', '.join(choices[:-1])} or {choices[-1]}"
         example = {"time": "time_s", "height": "height_m", "angle": "yaw_deg"}.get(quantity, "lat_deg")
         raise source.fault(
-            f"column {shown(at.name)} states no unit: say --{quantity}-unit {said}, or name it as in {example}"
+            f"column {shown(at.name)} states no unit: say --{quantity}-unit {listed}, or name it as in {example}"
         )
-    return said
+    return stated
 
 
-def _check_said(source: LogSource, at: Column, unit: str, said: str | None, quantity: str) -> None:
-    if said is not None and said != unit:
-        raise source.fault(f"column {shown(at.name)} is in {unit}, not in {said}: leave out --{quantity}-unit")
+def _check_stated_unit(source: LogSource, at: Column, unit: str, stated: str | None, quantity: str) -> None:
+    if stated is not None and stated != unit:
+        raise source.fault(f"column {shown(at.name)} is in {unit}, not in {stated}: leave out --{quantity}-unit")

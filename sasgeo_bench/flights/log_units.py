@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Units of flight logs: by what words names state them, and what is said of a log whose file does not."""
+"""Units of flight logs: by what words names state them, and what the user states of a log whose file does not."""
 
 import math
 from dataclasses import dataclass
@@ -106,7 +106,7 @@ class LogFacts:
         check_within("--speed-mps", self.speed_mps)
 
     def unit(self, quantity: str) -> str | None:
-        """Return the unit that is said of a quantity."""
+        """Return the unit that the user states for a quantity."""
         units = {
             "time": self.time_unit,
             "height": self.height_unit,
@@ -116,7 +116,7 @@ class LogFacts:
         return units[quantity]
 
     def check_untold(self, path: Path) -> None:
-        """Raise `FlightError` if a unit is said of a file that is no table: its format states them all."""
+        """Raise `FlightError` if a unit is stated for a file that is no table: its format states them all."""
         for quantity in UNITS:
             if self.unit(quantity) is not None:
                 raise FlightError(

@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SUFFIXES: Final = (".gpx", ".kml", ".csv", ".pos", ".tum", ".txt", ".tum.gz", ".txt.gz")
-MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones nobody knows where the drone was
+MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
 _TUM: Final = SUFFIXES[4:]
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
@@ -55,8 +55,8 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
         raise _meaningless(path, "has times", "--speed-mps")
     if height_m is None:
         return log
-    told = (*log.told, f"height: {height_m:g} m throughout, as --height-m says")
-    return replace(log, height_m=np.full(len(log), height_m), told=told)
+    notes = (*log.notes, f"height: {height_m:g} m throughout, as --height-m says")
+    return replace(log, height_m=np.full(len(log), height_m), notes=notes)
 
 
 def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
@@ -168,7 +168,7 @@ def read_flight(
     if log is None:
         logged = read_poses(path, facts, height_m=height_m)
     else:
-        for line in (*log.told, *gaps_of(log.time_s)):
+        for line in (*log.notes, *gaps_of(log.time_s)):
             tell(line)
         _check_near(log, path, region)
         logged = _on_grid(log, path, region.manifest.epsg, (facts and facts.speed_mps) or SPEED_MPS)

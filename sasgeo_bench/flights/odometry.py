@@ -43,14 +43,14 @@ def draw_gauss_markov(steps_m: Floats, *, length_m: float, rng: np.random.Genera
     kept, rest = np.exp(-u), -np.expm1(-u)
     value_sd = np.sqrt(-np.expm1(-2 * u))
     # Of the integral over the step, in units of the length: what of it the new value tells, and the remainder.
-    told = np.divide(rest**2, value_sd, out=np.zeros_like(u), where=value_sd > 0)
-    remainder = np.where(u > _FEW, 2 * u - 4 * rest - np.expm1(-2 * u) - told**2, u**3 / 6)
+    explained = np.divide(rest**2, value_sd, out=np.zeros_like(u), where=value_sd > 0)
+    remainder = np.where(u > _FEW, 2 * u - 4 * rest - np.expm1(-2 * u) - explained**2, u**3 / 6)
     first, second = rng.standard_normal((2, len(u)))
     values = np.empty(len(u) + 1)
     values[0] = rng.standard_normal()
     for at in range(len(u)):
         values[at + 1] = kept[at] * values[at] + value_sd[at] * first[at]
-    integrals = rest * values[:-1] + told * first + np.sqrt(np.maximum(remainder, 0.0)) * second
+    integrals = rest * values[:-1] + explained * first + np.sqrt(np.maximum(remainder, 0.0)) * second
     return Drawn(values=values, means=np.divide(integrals, u, out=values[:-1].copy(), where=u > 0))
 
 
@@ -214,7 +214,7 @@ def draw_odometry(
     -----
     A step z = right + i up becomes z exp(a - i (h + c)): a is the mean error of the logarithm of length over the step,
     c that of the course, h the mean error of heading that has come up since the step began. Heading errors before the
-    step need not be told: the increment is in the axes that the odometer believes in. All are integrals of processes
+    step do not matter: the increment is in the axes that the odometer believes in. All are integrals of processes
     over distance (`sasgeo_bench.flights.odometry`), so twice as many poses have the same drift after the same
     distance. Nothing drifts while hovering.
 
@@ -274,7 +274,7 @@ def dead_reckon(flown: Trajectory, steps: Odometry) -> Trajectory:
     """Return the trajectory that an odometer believes in, from the true first pose.
 
     Positions and headings follow from the increments, heights and tilt are those of the flight. Poses within a lost
-    stretch are left out, and after it the odometer goes on from where it was: nobody tells it how far it went.
+    stretch are left out, and after it the odometer goes on from where it was: it is not reset by how far it went.
     """
     yaw_deg = flown.yaw_deg[0] + np.concatenate([[0.0], np.cumsum(steps.yaw_deg)])
     increments = np.stack([steps.right_m, steps.up_m, steps.yaw_deg], axis=1)

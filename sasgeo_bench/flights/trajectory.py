@@ -188,7 +188,7 @@ def in_axes(flown: Trajectory, axes: Axes | None, path: Path) -> Trajectory:
     A body that flies level turns about the vertical, so the vertical is that axis of the frame that keeps its place in
     the body: the mean of the axis in the axes of the body has a length near 1. A body that does not turn tells nothing:
     straight up and straight ahead of a camera look alike, and so do a front and the ground. A loop turns about a level
-    axis as well; it is told by the body's first axis, which points along the way, where a camera looks with its third.
+    axis as well; it is known by the body's first axis, which points along the way, where a camera looks with its third.
     Warnings say so of both. A camera that looks ahead and down turns about an axis off the third by 10 to 80 degrees,
     and its path lies flat across that axis, as none does that climbs.
 
@@ -211,7 +211,7 @@ def in_axes(flown: Trajectory, axes: Axes | None, path: Path) -> Trajectory:
             position_m=flown.position_m @ _FRAME.T,
             quaternion_xyzw=type(flown.rotation).from_matrix(turns).as_quat(),
         )
-    if axes != "up" and len(flown) >= 10:  # of fewer nothing can be said
+    if axes != "up" and len(flown) >= 10:  # fewer decide nothing
         _check_upright(flown, axes, plain(str(path)))
     return flown
 
@@ -289,7 +289,7 @@ def read_tum(path: Path, *, axes: Axes | None = None) -> Trajectory:
     Parameters
     ----------
     path : Path
-        Text, or gzipped text, which is told by its first bytes. Lines that begin with "#" and empty lines are skipped.
+        Text, or gzipped text, which is known by its first bytes. Lines that begin with "#" and empty lines are skipped.
         `MOST_BYTES` of unpacked text and `MOST_POSES` are read at most.
     axes : {"up", "camera"}, optional
         Axes of the file: third axis up, or right, down and ahead of a camera, as KITTI and ORB-SLAM have them. By

@@ -101,7 +101,7 @@ class Record(BaseModel):
 class TrainingRecord(Record):
     """Record of a training in `run.json`.
 
-    `key` ties all rows to it (`task_files.asked_under`); `file` is that of the learned text, relative to the folder of
+    `key` ties all rows to it (`task_files.answer_hash`); `file` is that of the learned text, relative to the folder of
     the run, None where training failed; `trained_on` names places, and `pairs` counts queries with their truths.
     """
 
@@ -128,7 +128,7 @@ def learned_path(run: Path, training_sha256: str) -> Path:
 def read_learned(path: Path) -> str | None:
     """Read the learned text; None if there is none, `StoreError` if it is no such file, or is damaged.
 
-    Only a file of a run is said to be damaged: advice to remove it must not reach any other file or folder.
+    Only a file of a run is reported as damaged: advice to remove it must not reach any other file or folder.
     """
     if path.is_dir():
         raise StoreError(f"{path} is a folder, not a learned text: {WHERE}")

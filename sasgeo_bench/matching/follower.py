@@ -17,13 +17,13 @@ from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.matching.controls import reckoning
 from sasgeo_bench.matching.controls.blind import middle_m
 from sasgeo_bench.matching.controls.reckoning import Covariance, advance, start_of
-from sasgeo_bench.matching.matcher import MOST_SAID, Match, Matcher, MatcherCard, check_match, is_followed
+from sasgeo_bench.matching.matcher import MOST_CARD_TEXT, Match, Matcher, MatcherCard, check_match, is_followed
 from sasgeo_bench.matching.tracker import SIDE, Fix
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import Query, Step
 
 _VERSION: Final = 2
-_SAID: Final = (
+_DESCRIPTION: Final = (
     "on flights, of sasgeo-bench (Follower): each view is asked alone within {sigmas:g} sigma of what is believed, the "
     "first pose is taken up with {sigma_m:g} m and {sigma_yaw_deg:g} deg if its confidence, where there is one, is "
     "{least_confidence:g} and its Mahalanobis distance at most {gate:g}; else odometry is added up"
@@ -169,15 +169,15 @@ class Follower:
         found = check_match(self.matcher.match(asked, top_k=self.plan.top_k), asked, top_k=self.plan.top_k)
         corrected, is_accepted = self.corrected(belief, found, query)
         self._belief = _sound(corrected)
-        told = dict(found.diagnostics)
-        if asked.prior.radius_m is not None and len(told) < MOST_DIAGNOSTICS:
-            told["searched_m"] = asked.prior.radius_m
+        diagnostics = dict(found.diagnostics)
+        if asked.prior.radius_m is not None and len(diagnostics) < MOST_DIAGNOSTICS:
+            diagnostics["searched_m"] = asked.prior.radius_m
         return Fix(
             pose=self._belief.pose,
             covariance=self._belief.covariance,
             is_accepted=is_accepted,
             confidence=found.confidence if is_accepted else None,
-            diagnostics=told,
+            diagnostics=diagnostics,
         )
 
     def moved(self, belief: Belief, step: Step) -> Belief:
@@ -254,8 +254,8 @@ def _sound(belief: Belief) -> Belief:
 
 def card_on_flights(card: MatcherCard, plan: FollowPlan | None = None) -> MatcherCard:
     """Return the card of a matcher of single views with a word on how it follows flights."""
-    ours = f"{card.ours}; {_SAID.format(**asdict(plan or FollowPlan()))}"
-    return replace(card, ours=ours if len(ours) <= MOST_SAID else card.ours, tracks=(*card.tracks, "sequence"))
+    ours = f"{card.ours}; {_DESCRIPTION.format(**asdict(plan or FollowPlan()))}"
+    return replace(card, ours=ours if len(ours) <= MOST_CARD_TEXT else card.ours, tracks=(*card.tracks, "sequence"))
 
 
 def follower_record(card: MatcherCard) -> dict[str, Any] | None:

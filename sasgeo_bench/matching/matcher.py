@@ -92,7 +92,7 @@ def matcher_hash(spec: str, version: str, code: bytes, settings: str) -> str:
 
 Need = Literal["position", "yaw", "scale", "vectors", "image", "imagery", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
-MOST_SAID: Final = 4000  # characters of a field of a card
+MOST_CARD_TEXT: Final = 4000  # characters of a field of a card
 MOST_LISTED: Final = 1000  # items of a field
 MOST_SHOWN: Final = 80  # of a wrong one
 MOST_LEARNED_BYTES: Final = 2**20  # of a learned text, as UTF-8
@@ -162,22 +162,22 @@ class MatcherCard:
             raise MatchError("card: tracks is empty, name retrieval, localization or both")
 
 
-def check_card(said: Mapping[str, object], **known: Sequence[str]) -> None:
+def check_card(card: Mapping[str, object], **known: Sequence[str]) -> None:
     """Refuse a card of any kind, by its fields, that lacks a fact, or holds no lines, or none of the `known` values."""
     for name in ("name", "version", "title", "source", "ours", "licence"):
-        value = said[name]
+        value = card[name]
         if not isinstance(value, str) or not value.strip():
             raise MatchError(f"card: {name} is empty, say it in one line")
-    for name, value in said.items():
+    for name, value in card.items():
         items = value if isinstance(value, tuple | list) else () if isinstance(value, bool) else (value,)
         wrong = next((item for item in items if item not in known[name]), None) if name in known else None
         if wrong is not None:
             raise MatchError(f"card: {name} holds {wrong!r}, known are {', '.join(known[name])}")
         if len(items) > MOST_LISTED:
             raise MatchError(f"card: {name} holds {len(items)} lines, expected at most {MOST_LISTED}")
-        if not all(isinstance(item, str) and is_line(item, MOST_SAID) for item in items):
-            raise MatchError(f"card: {name} must be one line of at most {MOST_SAID} printable characters")
-    check_identity(str(said["name"]), str(said["version"]))
+        if not all(isinstance(item, str) and is_line(item, MOST_CARD_TEXT) for item in items):
+            raise MatchError(f"card: {name} must be one line of at most {MOST_CARD_TEXT} printable characters")
+    check_identity(str(card["name"]), str(card["version"]))
 
 
 def check_identity(name: str, version: str) -> None:
@@ -404,14 +404,14 @@ def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False, is_pictur
     """Return why a query is not applicable to a matcher, or None: its track, or a need of the card that it lacks.
 
     `is_taught` says whether the matcher was trained, `is_pictured` whether the searched map has imagery. A matcher of
-    single views that is asked about a flight (`is_followed`) is told place and heading for each view.
+    single views that is asked about a flight (`is_followed`) gets place and heading for each view.
     """
-    is_told = query.track == "sequence" and is_followed(card)
-    if query.track not in card.tracks and not is_told:
+    gets_belief = query.track == "sequence" and is_followed(card)
+    if query.track not in card.tracks and not gets_belief:
         return f"track {query.track}"
     has = {
-        "position": is_told or query.prior.center_m is not None or bool(query.candidates),
-        "yaw": is_told or query.prior.yaw_deg is not None,
+        "position": gets_belief or query.prior.center_m is not None or bool(query.candidates),
+        "yaw": gets_belief or query.prior.yaw_deg is not None,
         "scale": True,
         "vectors": query.vectors is not None,
         "image": bool(query.frames),

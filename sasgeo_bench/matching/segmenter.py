@@ -64,7 +64,7 @@ class ImageTraining:
     Parameters
     ----------
     images : sequence of LabelledImage
-        All label the same classes in the same order; what nobody has looked at is UNKNOWN. In a run each is read from
+        All label the same classes in the same order; what is not labelled is UNKNOWN. In a run each is read from
         disk when it is asked for: take them one after the other, and keep what is needed of each.
 
     Examples
@@ -133,7 +133,7 @@ def check_segmentation(found: object, image: AerialImage, *, classes: Sequence[s
     image : AerialImage
         The image that it was asked about.
     classes : sequence of str
-        Those of the card; with none, any class of the taxonomy may be told.
+        Those of the card; with none, any class of the taxonomy may be reported.
 
     Raises
     ------
@@ -158,5 +158,5 @@ def check_segmentation(found: object, image: AerialImage, *, classes: Sequence[s
     wrong = next((name for name in found.classes if name not in known), None)
     if wrong is not None:
         whose = "the card names" if classes else "the taxonomy has"
-        raise MatchError(f"segment() told the class {wrong[:60]!r}, {whose} {', '.join(known)}")
+        raise MatchError(f"segment() returned the class {wrong[:60]!r}, {whose} {', '.join(known)}")
     return found

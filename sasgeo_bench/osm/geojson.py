@@ -188,8 +188,8 @@ def _is_sequence(text: bytes) -> bool:
 
 
 def _is_lonlat(crs: Any) -> bool:  # noqa: ANN401 - what a file holds
-    said = crs.get("properties", crs) if isinstance(crs, dict) else {"name": crs}
-    name = said.get("name", said.get("code")) if isinstance(said, dict) else None
+    members = crs.get("properties", crs) if isinstance(crs, dict) else {"name": crs}
+    name = members.get("name", members.get("code")) if isinstance(members, dict) else None
     return _WGS84.fullmatch(str(name)) is not None
 
 
@@ -302,8 +302,8 @@ def identity_of(feature: Mapping[str, object], *, is_ogr: bool = False) -> Ident
     Identity(is_relation=False, osm_id=13)
     """
     properties = _properties(feature)
-    said = (str(properties.get(name)).lower() for name in _TYPES)
-    kind = next((_OBJECTS[each] for each in said if each in _OBJECTS), "")
+    types = (str(properties.get(name)).lower() for name in _TYPES)
+    kind = next((_OBJECTS[each] for each in types if each in _OBJECTS), "")
     for value in (*(properties.get(name) for name in ("@id", "@osmId", "id")), feature.get("id")):
         named = _NAMED_ID.fullmatch(value) if isinstance(value, str) else None
         if named is not None and named[1] == "a":

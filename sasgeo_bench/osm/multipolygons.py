@@ -147,7 +147,7 @@ def adopt_tags(
         return relation
     common = frozenset.intersection(*(frozenset(way.tags.items()) for way in speaking.values()))
     tags = {**dict(common), **relation.tags}
-    holes = tuple(ref for ref, way in inner.items() if _is_told_by(way.tags, tags))
+    holes = tuple(ref for ref, way in inner.items() if _is_described_by(way.tags, tags))
     return replace(relation, labels=labels, tags=tags, taken=(*relation.outer, *holes))
 
 
@@ -155,9 +155,9 @@ def _drawn(label: Label) -> tuple[str, bool]:
     return label.class_name, label.is_outline
 
 
-def _is_told_by(tags: Tags, others: Tags) -> bool:
-    told = {key: value for key, value in tags.items() if key.lower().split(":")[0] not in _ABOUT_THE_MAP}
-    return told.items() <= others.items()
+def _is_described_by(tags: Tags, others: Tags) -> bool:
+    own = {key: value for key, value in tags.items() if key.lower().split(":")[0] not in _ABOUT_THE_MAP}
+    return own.items() <= others.items()
 
 
 def roles_by_place(relation: Relation, area: shapely.Geometry, lines: Mapping[int, shapely.Geometry]) -> Relation:

@@ -232,8 +232,7 @@ def read_geojson(
     objects = _objects(scan)
     mapped = _mapped(name, scan, grid, area=stated_coverage, source="region file", frame=_frame(objects))
     warning = classless(scan)
-    told = (warning,) if warning else ()
-    return _reading(name, scan, grid, mapped, objects=objects, classes=classes, warnings=told)
+    return _reading(name, scan, grid, mapped, objects=objects, classes=classes, warnings=(warning,) if warning else ())
 
 
 def misdated(

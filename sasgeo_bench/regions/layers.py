@@ -52,7 +52,7 @@ _SAMPLE_PX: Final = 1024  # of a block, where it is larger
 class Bands:
     """Numbers of the bands that are red, green and blue, from 1 on; and that of alpha, if there is one.
 
-    `note` is what whoever builds the region should know of the choice; empty where there was none.
+    `note` is what the user should know of the choice; empty where there was none.
     """
 
     rgb: tuple[int, int, int] = (1, 2, 3)
@@ -108,13 +108,13 @@ def colour_bands(interpretation: Sequence[ColorInterp], names: Sequence[str | No
     """
     words = [_colour_of(name or "") for name in names]
     named, listed = _each_once(words), ", ".join(one_line(name or "")[:20] or "nothing" for name in names[:8])
-    told = _each_once([item.name if item in _COLOURS else "" for item in interpretation])
-    if told:
-        called = [(words[band - 1], item.name) for band, item in zip(told, _COLOURS, strict=True)]
-        if all(word in ("", colour) for word, colour in called) and named in (None, told):
-            return _Colours(told)
+    bands = _each_once([item.name if item in _COLOURS else "" for item in interpretation])
+    if bands:
+        called = [(words[band - 1], item.name) for band, item in zip(bands, _COLOURS, strict=True)]
+        if all(word in ("", colour) for word, colour in called) and named in (None, bands):
+            return _Colours(bands)
         by_names = f"{named or listed} by their names"
-        return _Colours(fault=f"red, green and blue are {told} by their colour interpretation, {by_names}")
+        return _Colours(fault=f"red, green and blue are {bands} by their colour interpretation, {by_names}")
     if len(interpretation) < len(_COLOURS) or not set(interpretation) <= _SILENT:
         return _Colours()
     if named or any(words):

@@ -166,14 +166,14 @@ class MapGraph:
     edges: "pd.DataFrame"
 
 
-class Late(Generic[Value]):
+class Lazy(Generic[Value]):
     """A field of a frozen dataclass that may be given as a function, which is called when the field is first read.
 
     Examples
     --------
     >>> @dataclass(frozen=True)
     ... class Place:
-    ...     height_m: Late[float] = Late()
+    ...     height_m: Lazy[float] = Lazy()
     >>> place = Place(lambda: print("reading") or 2.5)
     >>> place.height_m + place.height_m
     reading
@@ -207,9 +207,9 @@ class Region:
     """
 
     manifest: Manifest
-    layers: Late[NDArray[np.uint8]] = Late()
-    features: Late["gpd.GeoDataFrame"] = Late()
-    graph: Late[MapGraph] = Late()
+    layers: Lazy[NDArray[np.uint8]] = Lazy()
+    features: Lazy["gpd.GeoDataFrame"] = Lazy()
+    graph: Lazy[MapGraph] = Lazy()
     coverage: shapely.Geometry
     imagery: Imagery | None = None
     read_layer: Callable[[int], NDArray[np.uint8]] | None = None

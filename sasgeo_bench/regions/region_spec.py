@@ -154,7 +154,7 @@ class RegionFile(NamedDocument):
         try:
             grid = self.grid()
         except ConfigError:
-            return  # said when the region is built
+            return  # reported when the region is built
         grid_west, _, grid_east, _ = to_lonlat(grid.epsg).transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
         if grid_west > grid_east:
             raise ValueError(

@@ -24,7 +24,7 @@ from sasgeo_bench.running.plan import RunPart, RunPlan, by_map, reach_of
 from sasgeo_bench.running.sandbox import PROMISES, joined
 from sasgeo_bench.running.worker import Reply, Worker, guarded
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.tasks.task_files import asked_under
+from sasgeo_bench.tasks.task_files import answer_hash
 
 GIVEN_UP: Final = "given up after"  # begins the message of those that are not asked any more
 
@@ -67,14 +67,14 @@ Item = TypeVar("Item")
 LEAST_ITEMS: Final = 8
 
 
-def pays(*, left: int, askers: int, start_s: float, pace_s: float | None) -> bool:
-    """Return whether one more process pays: whether its share of the queries takes at least as long as its start.
+def is_worth_starting(*, left: int, askers: int, start_s: float, pace_s: float | None) -> bool:
+    """Return whether one more process is worth its start: whether its share of the queries takes as long at least.
 
     `left` queries are pending for `askers` processes; `start_s` includes preparing the map. While the time of a query,
     `pace_s`, is unknown, the share must hold `LEAST_ITEMS` queries.
 
-    >>> pays(left=40, askers=1, start_s=2.0, pace_s=0.01), pays(left=40, askers=1, start_s=2.0, pace_s=1.0)
-    (False, True)
+    >>> [is_worth_starting(left=40, askers=1, start_s=2.0, pace_s=pace_s) for pace_s in (0.01, 1.0)]
+    [False, True]
     """
     share = left / (askers + 1)
     return share >= LEAST_ITEMS if pace_s is None else share * pace_s >= start_s
@@ -101,7 +101,7 @@ class Schedule(Generic[Item]):
         self.is_stopped = False
 
     def take(self) -> int | None:
-        """Return the map to work on next, or None if nothing is left; wait until it is known whether help pays."""
+        """Return the map to work on next, or None if nothing is left; wait until help is known to be worth it."""
         with self._changed:
             while not self.is_stopped:
                 line = next((line for line in self._lines if line.askers == 0), None) or self._in_need()
@@ -114,7 +114,7 @@ class Schedule(Generic[Item]):
         return None
 
     def _in_need(self) -> "_Line[Item] | None":
-        in_need = (line for line in self._lines if line.pays())
+        in_need = (line for line in self._lines if line.is_worth_starting())
         return max(in_need, key=lambda line: line.left / (line.askers + 1), default=None)
 
     def groups(self, number: int) -> Iterator[Sequence[Item]]:
@@ -170,9 +170,11 @@ class _Line(Generic[Item]):
         else:
             self._spent_s, self._count = self._spent_s + seconds, self._count + count
 
-    def pays(self) -> bool:
+    def is_worth_starting(self) -> bool:
         pace_s = self._spent_s / self._count if self._count else None
-        return self.left > 0 and pays(left=self.left, askers=self.askers, start_s=self._start_s, pace_s=pace_s)
+        return self.left > 0 and is_worth_starting(
+            left=self.left, askers=self.askers, start_s=self._start_s, pace_s=pace_s
+        )
 
 
 PART_ROWS: Final = 64
@@ -300,7 +302,7 @@ class _Map:
         for writer in self._writers:
             writer.begin()
             for query, blob, asked in writer.part.task.some(frozenset(writer.part.left)):
-                if writer.part.asked[query.query_id] != asked_under(asked, writer.part.key):
+                if writer.part.asked[query.query_id] != answer_hash(asked, writer.part.key):
                     raise StoreError(
                         f"{writer.part.task.folder} was made anew while it was asked: run again, answers are kept"
                     )

@@ -18,7 +18,7 @@ _DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
 Item = TypeVar("Item")
 
 
-def stops_all(error: BaseException | None) -> bool:
+def is_disk_error(error: BaseException | None) -> bool:
     """Return whether an error comes from a disk that is full, read-only or broken, and not from an entry."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in _DISK:
@@ -48,7 +48,7 @@ def log_beside(board: Path) -> Path:
 
 
 class Failures:
-    """Failed entries by name, with the cause of each as one line, which is told; tracebacks are appended to `log`.
+    """Failed entries by name, with the cause of each as one line, which is reported; tracebacks are appended to `log`.
 
     >>> from sasgeo_bench.core.progress import reporting
     >>> failures = Failures(Path("failures.log"))
@@ -59,10 +59,10 @@ class Failures:
     {'graph': 'it has no card'}
     """
 
-    def __init__(self, log: Path, *, is_told: bool = True) -> None:
+    def __init__(self, log: Path, *, is_reported: bool = True) -> None:
         self.found: dict[str, str] = {}
         self.errors: dict[str, Exception] = {}
-        self.log, self._is_told = log, is_told
+        self.log, self._is_reported = log, is_reported
 
     @property
     def first(self) -> Exception | None:
@@ -75,7 +75,7 @@ class Failures:
         try:
             yield
         except Exception as error:
-            if isinstance(error, but) or stops_all(error):
+            if isinstance(error, but) or is_disk_error(error):
                 raise
             self.note(name, error)
 
@@ -88,7 +88,7 @@ class Failures:
             write_log(self.log, name, error)
         self.errors.setdefault(name, error)
         line = line.removeprefix(f"{name}: ")
-        if self.found.setdefault(name, line) == line and self._is_told:
+        if self.found.setdefault(name, line) == line and self._is_reported:
             tell(f"{name} failed: {line}")
 
     def blame(self, items: Mapping[str, Item], work: Callable[[Mapping[str, Item]], object]) -> bool:

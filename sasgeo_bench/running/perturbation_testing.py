@@ -85,7 +85,7 @@ class _Kit:
         moves = getattr(self.perturbation, "moves_cells", False)
         kept = "cells move, and nothing appears" if moves else "unknown cells stay unknown"
         found = f"{len(self.views)} views"
-        told: dict[str, str] = {}
+        first_of: dict[str, str] = {}
         for row in tried(
             (
                 ("gives a view of the same classes and shape", self.keeps_shape, found),
@@ -99,9 +99,9 @@ class _Kit:
                 ("refuses what is no strength", self.refuses, found),
             )
         ):
-            first = told.setdefault(row.found, row.name)
+            first = first_of.setdefault(row.found, row.name)
             is_again = row.outcome == "fail" and first != row.name
-            yield replace(row, found=f"as said of: {first}") if is_again else row
+            yield replace(row, found=f"as in: {first}") if is_again else row
 
     @property
     def perturbation(self) -> Perturbation:

@@ -33,14 +33,14 @@ from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_train
 from sasgeo_bench.running.worker import Limits, Reach, Reply, Worker, loaded_card
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.task_files import Task, TaskManifest, asked_under, tie_key
+from sasgeo_bench.tasks.task_files import Task, TaskManifest, answer_hash, dependency_key
 
 # Modules of this package that answers depend on, if a plugin imports them: after a change there, it is asked anew.
 TOOLS: Final = (
     *("matching.controls", "matching.follower", "osm.taxonomy", "regions.evidence", "regions.graph"),
     *("search", "sasgeo", "tasks.vectors"),
 )
-# The same of segmentations; whoever segments looks at pictures by all of them.
+# The same of segmentations; segmenters look at pictures by all of them.
 SEGMENTER_TOOLS: Final = ("sensing.segmentation", "sensing.image", "sensing.camera")
 
 
@@ -83,7 +83,7 @@ class RunRequest:
     out/runs/<matcher>/<hash>/<suite>/<region> below `out`. `jobs` counts processes at once; `dask` is the address of a
     scheduler, or local:N for N processes on this machine, with `jobs` 1. `shard` is (i, n), from 1: the i-th of n parts
     of the queries; `limit` bounds the queries of each task. Queries are asked again whose row has a status in `again`
-    or was written before the stamp `since_ns`. Without `is_shut_in`, trusted code runs without isolation, and
+    or was written before the stamp `since_ns`. Without `is_sandboxed`, trusted code runs without isolation, and
     `run.json` says so.
 
     `train` are tasks with truths, of places that are not asked, for a matcher with a `learn`; `most_trained` bounds
@@ -105,7 +105,7 @@ class RunRequest:
     limit: int | None = None
     again: Sequence[str] = ()
     since_ns: int = 0
-    is_shut_in: bool = True
+    is_sandboxed: bool = True
     train: Sequence[Path] = ()
     most_trained: int = 200
     lessons: Lessons = field(default_factory=Lessons)
@@ -119,11 +119,11 @@ class RunRequest:
 class RunPart:
     """One task of a run: its folder of rows, its map, and its pending queries.
 
-    `asked` gives the hash that the row of each pending query carries (`task_files.asked_under`); `failed` counts rows
-    by status of queries that were asked in vain and are not pending; `aside` counts rows of earlier queries, of other
-    training, or of other imagery. `imagery` is the hash of rendered imagery that the matcher looks at, `follower` says
-    how a matcher of single views is asked about flights (`follower.follower_record`), and `key` what its rows are tied
-    to.
+    `asked` gives the hash that the row of each pending query carries (`task_files.answer_hash`); `failed` counts rows
+    by status of queries that were asked in vain and are not pending; `excluded` counts rows of earlier queries, of
+    other training, or of other imagery. `imagery` is the hash of rendered imagery that the matcher looks at,
+    `follower` says how a matcher of single views is asked about flights (`follower.follower_record`), and `key` what
+    its rows are tied to.
     """
 
     task: Task
@@ -132,7 +132,7 @@ class RunPart:
     left: tuple[str, ...]
     asked: Mapping[str, str]
     done: int
-    aside: int
+    excluded: int
     failed: Mapping[str, int] = field(default_factory=dict)
     imagery: str | None = None
     follower: FollowerRecord | None = None
@@ -200,8 +200,10 @@ class RunPlan:
 
 
 def _state(parts: Sequence[RunPart]) -> str:
-    left, done, aside = (sum(column) for column in zip(*((len(x.left), x.done, x.aside) for x in parts), strict=True))
-    others = f", {counted(aside, 'answer')} to other queries set aside" if aside else ""
+    left, done, excluded = (
+        sum(column) for column in zip(*((len(x.left), x.done, x.excluded) for x in parts), strict=True)
+    )
+    others = f", {counted(excluded, 'answer')} to other queries set aside" if excluded else ""
     return f"{counted(left, 'query', 'queries')} left, {done} done{others}"
 
 
@@ -228,7 +230,9 @@ def plan_run(request: RunRequest) -> RunPlan:
     card, code, learns = _card(request)
     _check_seen(tasks, card)
     limits = _hashed(request.limits, learns=learns)
-    settings = json.dumps({"top_k": request.top_k, "limits": limits, "is_shut_in": request.is_shut_in}, sort_keys=True)
+    settings = json.dumps(
+        {"top_k": request.top_k, "limits": limits, "is_sandboxed": request.is_sandboxed}, sort_keys=True
+    )
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
     training_set = result = None
     if learns and request.train:
@@ -340,7 +344,7 @@ def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
     # Other dates of a place, and the map that a twin was edited from, would reveal the changes.
     maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
     hidden += [*(path for path in maps if path not in readable), *request.hidden]
-    return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
+    return Reach(readable=readable, hidden=hidden, is_sandboxed=request.is_sandboxed)
 
 
 def hidden_below(roots: Sequence[Path]) -> list[Path]:
@@ -376,8 +380,8 @@ def _part(request: RunRequest, card: MatcherCard, found: str, key: str | None, t
     imagery = _rendered_imagery(card, region)
     settings = follower_record(card) if about.is_of_flights else None
     follower = None if settings is None else FollowerRecord(**settings)
-    key = tie_key(key, imagery, None if follower is None else follower.hash)
-    asked = {name: asked_under(one, key) for name, one in task.asked.items()}
+    key = dependency_key(key, imagery, None if follower is None else follower.hash)
+    asked = {name: answer_hash(one, key) for name, one in task.asked.items()}
     ties = prediction_files.read_ties(folder, since_ns=request.since_ns) if folder.is_dir() else []
     is_same_task = before is not None and before.queries_sha256 == about.queries_sha256
     if not (is_same_task or all(tie.asked for tie in ties)):  # rows of older versions lack the hash of their query
@@ -405,7 +409,7 @@ def _part(request: RunRequest, card: MatcherCard, found: str, key: str | None, t
         asked={name: asked[name] for name in left},
         done=len(own) - len(left),
         failed=failed,
-        aside=len({(tie.query_id, tie.asked) for tie in ties if not tie.answers(asked)}),
+        excluded=len({(tie.query_id, tie.asked) for tie in ties if not tie.answers(asked)}),
         imagery=imagery,
         follower=follower,
         key=key,

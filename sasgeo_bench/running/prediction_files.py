@@ -38,7 +38,7 @@ from sasgeo_bench.matching.cards import Names, Record, TrainingRecord
 from sasgeo_bench.matching.matcher import SAME_PLACE_M, STATUSES, Prediction
 from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE, are_covariances
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.tasks.task_files import ASKED, POSE_FIELDS, asked_under, is_like, poses_of, tie_key
+from sasgeo_bench.tasks.task_files import ASKED, POSE_FIELDS, answer_hash, dependency_key, is_like, poses_of
 
 RUN: Final = "run.json"
 PACKED: Final = "packed.json"  # beside it where answers came packed: they were not asked here, whatever `run.json` says
@@ -138,7 +138,7 @@ class RunManifest(Record):
     def key(self) -> str | None:
         """Return what rows are tied to besides their queries: training, rendered imagery, how flights are followed."""
         training, follower = self.learned, self.follower
-        return tie_key(
+        return dependency_key(
             None if training is None else training.key,
             self.rendered_imagery,
             None if follower is None else follower.hash,
@@ -309,13 +309,13 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """Answers to queries, a row for each with the columns of `PART_SCHEMA`; `aside` counts rows that answer others.
+    """Answers to queries, a row for each with the columns of `PART_SCHEMA`; `excluded` counts rows that answer others.
 
     They are `rounded`, so that a board scored from its stored answers is the same.
     """
 
     table: pa.Table
-    aside: int = 0
+    excluded: int = 0
 
     @classmethod
     def open(cls, folder: Path, asked: Mapping[str, str], *, is_tied: bool = True) -> Self:
@@ -327,17 +327,17 @@ class Answers:
         """
         tables: list[pa.Table] = []
         seen: set[str] = set()
-        aside: set[Tie] = set()
+        excluded: set[Tie] = set()
         parts = parts_of(folder)
         under = {parent: asked_in(parent, asked) for parent in {part.parent for part in parts}}
         for part in reversed(parts):
             table = _checked(part, is_own=part != folder)
             ties = _ties_of(table)
             is_own = [tie.answers(under[part.parent], is_tied=is_tied) for tie in ties]
-            aside |= {replace(tie, status="") for tie, own in zip(ties, is_own, strict=True) if not own}
+            excluded |= {replace(tie, status="") for tie, own in zip(ties, is_own, strict=True) if not own}
             ids = [tie.query_id if own else None for tie, own in zip(ties, is_own, strict=True)]
             tables.append(_newest(table, ids, seen))
-        return cls(rounded(_joined(tables)), len(aside))
+        return cls(rounded(_joined(tables)), len(excluded))
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -641,7 +641,7 @@ def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
     {'a': 'ff'}
     """
     key = read_key(folder)
-    return {name: asked_under(one, key) for name, one in asked.items()}
+    return {name: answer_hash(one, key) for name, one in asked.items()}
 
 
 def read_key(folder: Path) -> str | None:

@@ -51,7 +51,7 @@ class ProfileRequest:
     radius_m: float | None = None
     top_k: int = 25
     train: Sequence[Path] = ()
-    is_shut_in: bool = True
+    is_sandboxed: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +66,7 @@ class Fix:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """What the sensors said at a time; None where there are none."""
+    """Readings of the sensors at a time; None where there are none."""
 
     since_s: float
     celsius: float | None
@@ -230,7 +230,7 @@ def plan_profile(request: ProfileRequest) -> RunPlan:
             out=request.out,
             top_k=request.top_k,
             limits=limits,
-            is_shut_in=request.is_shut_in,
+            is_sandboxed=request.is_sandboxed,
             train=request.train,
         )
     )
@@ -287,7 +287,7 @@ def _sustained(
 ) -> tuple[list[Fix], list[Reading]]:
     fixes: list[Fix] = []
     readings: list[Reading] = []
-    begun, label, told = time.perf_counter(), f"{request.spec} profiled", 0
+    begun, label, reported = time.perf_counter(), f"{request.spec} profiled", 0
     progress.begin(label, round(request.sustain_s))
     for blob in cycle(asked):
         since_s = time.perf_counter() - begun
@@ -310,8 +310,8 @@ def _sustained(
             why = f"{reply.status}: {reply.message}" if reply.message else reply.status
             raise MatchError(f"{request.spec}: none of the first {LEAST_FIXES} fixes is an answer ({why})")
         done = min(round(since_s + taken_s), round(request.sustain_s))
-        progress.advance(label, done - told)
-        told = done
+        progress.advance(label, done - reported)
+        reported = done
     readings.append(Reading(since_s=time.perf_counter() - begun, celsius=hottest_celsius(), mhz=clock_mhz()))
     return fixes, readings
 

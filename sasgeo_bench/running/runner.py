@@ -127,10 +127,10 @@ def _tell_state(plan: RunPlan) -> None:
     for status, count in sorted(sum((Counter(part.failed) for part in plan.parts), Counter()).items()):
         rows = counted(count, "earlier query", "earlier queries")
         tell(f"{plan.card.name}: {rows} ended as {status}; --again {status} asks again")
-    aside = sum(part.aside for part in plan.parts)
-    if aside:
+    excluded = sum(part.excluded for part in plan.parts)
+    if excluded:
         others = "" if plan.training_set is None else ", or of other learning"
-        rows = counted(aside, "answer")
+        rows = counted(excluded, "answer")
         tell(f"{plan.card.name}: {rows} to queries that these tasks do not hold now{others}, set aside")
 
 

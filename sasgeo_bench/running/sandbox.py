@@ -195,7 +195,7 @@ class Policy:
 
     `scratch` is an empty resolved folder, the only writable one; `hidden` paths stay hidden wherever they lie. The
     limits hold for the address space of each process, the largest file, and all files together. `unsearched` describes
-    where nobody searched for paths to hide.
+    where no search for paths to hide was made.
     """
 
     readable: Sequence[str]
@@ -243,14 +243,14 @@ def enter(policy: Policy) -> Isolation:
         raise OSError(f"{policy.scratch} leads elsewhere, expected a resolved folder")
     hidden = outermost(policy.hidden)
     spaces = _enter_namespaces()
-    is_apart = bool(spaces & CLONE_NEWPID)
-    _fork(_Keeper(is_apart=is_apart, can_die=True))
+    has_pid_namespace = bool(spaces & CLONE_NEWPID)
+    _fork(_Keeper(has_pid_namespace=has_pid_namespace, can_die=True))
     has_root = bool(spaces & CLONE_NEWNS) and enter_root(
         policy.scratch, shown=policy.readable, hidden=hidden, scratch_bytes=policy.scratch_bytes
     )
-    has_proc = is_apart and has_root and has_own_proc()
-    if is_apart:  # not the first process in it, which gets no signals from itself and must adopt orphans
-        _fork(_Keeper(is_apart=True, can_die=False))
+    has_proc = has_pid_namespace and has_root and has_own_proc()
+    if has_pid_namespace:  # not the first process in it, which gets no signals from itself and must adopt orphans
+        _fork(_Keeper(has_pid_namespace=True, can_die=False))
     if has_root:  # an inherited descriptor would give access to the system's root
         nothing = os.open("/dev/null", os.O_RDONLY)
         os.dup2(nothing, 0)
@@ -418,15 +418,15 @@ def _fork(keeper: "_Keeper") -> None:
 class _Keeper:
     """A process that waits for its child, reaps orphans meanwhile, and leaves no process behind when either ends.
 
-    If the child has a process namespace (`is_apart`), all in it end with its first process. Otherwise processes that
-    leave their parents become children of the keeper.
+    If the child has a process namespace (`has_pid_namespace`), all in it end with its first process. Otherwise
+    processes that leave their parents become children of the keeper.
     """
 
-    is_apart: bool
+    has_pid_namespace: bool
     can_die: bool
 
     def prepare(self) -> None:
-        if not self.is_apart:
+        if not self.has_pid_namespace:
             kernel.prctl(kernel.PR_SET_CHILD_SUBREAPER, 1)
 
     def keep(self, child: int) -> NoReturn:
@@ -459,10 +459,10 @@ class _Keeper:
     def _kill(self, child: int) -> None:
         """Kill a child, if given, and without a namespace all descendants; wait until they are gone."""
         while True:
-            for number in [child] if self.is_apart else _below(os.getpid()):
+            for number in [child] if self.has_pid_namespace else _below(os.getpid()):
                 if number:
                     _kill(number)
-            if self.is_apart and not child:
+            if self.has_pid_namespace and not child:
                 return
             try:
                 os.wait()

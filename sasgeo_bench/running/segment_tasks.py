@@ -19,7 +19,7 @@ from sasgeo_bench.matching.segmenter import check_text
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
-from sasgeo_bench.running.training import Said, recalibrated
+from sasgeo_bench.running.training import SegmentedQuery, recalibrated
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage
@@ -34,7 +34,7 @@ from sasgeo_bench.tasks.task_files import Task, TruthManifest
 
 FOLDER: Final = "segmenters"  # below the root: what segmenters learned
 _TRAIN: Final = "train"
-_MOST_SHOWN: Final = 3  # failures that are told
+_MOST_SHOWN: Final = 3  # failures that are shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,13 +56,13 @@ class SegmentTasks:
     is_recalibrated: bool = False
     most: int = 80
     limits: Limits = field(default_factory=Limits)
-    is_shut_in: bool = True
+    is_sandboxed: bool = True
     jobs: int = 1
 
     @property
     def request(self) -> SegmentRequest:
         """Return what its processes are started by."""
-        return SegmentRequest(spec=self.spec, out=self.out, limits=self.limits, is_shut_in=self.is_shut_in)
+        return SegmentRequest(spec=self.spec, out=self.out, limits=self.limits, is_sandboxed=self.is_sandboxed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +79,7 @@ class _Group:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Sight:
+class _ReadySegmenter:
     """A segmenter ready to see the pictures of some tasks: its card, and what it learned for them."""
 
     request: SegmentRequest
@@ -130,7 +130,7 @@ def segment_tasks(wanted: SegmentTasks) -> tuple[Path, ...]:
     ConfigError
         If a task has no pictures, the split does not speak of it, or there is nothing to learn from.
     MatchError
-        If the segmenter cannot be loaded. A picture that it fails at has no evidence; it is told, counted in the
+        If the segmenter cannot be loaded. A picture that it fails at has no evidence; it is reported, counted in the
         `task.json` that results, and tried again by the next call.
     StoreError
         If a task, its truths or labels, or what was learned, are missing or damaged, or training fails.
@@ -144,13 +144,13 @@ def segment_tasks(wanted: SegmentTasks) -> tuple[Path, ...]:
             left = named(sorted(task.folder.name for task in group.asked), "train place")
             tell(f"left out: {left}, which {loaded.card.name} learns from")
             continue
-        sight = _Sight(
+        ready = _ReadySegmenter(
             request=request,
             loaded=loaded,
             learned=_learned(wanted, loaded, group) if loaded.learns else None,
             is_recalibrated=wanted.is_recalibrated,
         )
-        work, label = partial(_segmented, sight), f"{sight.name}, {group.name}"
+        work, label = partial(_segmented, ready), f"{ready.name}, {group.name}"
         for folder, lines in spread(work, group.asked, jobs=wanted.jobs, label=label):
             made.append(folder)
             for line in lines:
@@ -261,10 +261,10 @@ def _image(query: Query, number: int) -> AerialImage:
     return query.frames[number].image(observed_on=query.observed_on, season=query.season)
 
 
-def _segmented(sight: _Sight, task: Task) -> tuple[Path, list[str]]:
+def _segmented(ready: _ReadySegmenter, task: Task) -> tuple[Path, list[str]]:
     """Segment one task unless that is done already; return the folder of the task that results, and what to tell."""
     about, root = task.manifest, task.root
-    suite, record = name_of(about.suite, sight.name), sight.record(task)
+    suite, record = name_of(about.suite, ready.name), ready.record(task)
     folder = root / "tasks" / suite / about.region
     if _is_made(folder, record, root):
         return folder, []
@@ -272,7 +272,7 @@ def _segmented(sight: _Sight, task: Task) -> tuple[Path, list[str]]:
     task.check_truths()
     faults: list[str] = []
     lines: list[str] = []
-    done = _seen_by(sight, task, suite, faults)
+    done = _seen_by(ready, task, suite, faults)
     new = {"suite": suite, "segmenter": record, **({"failed_pictures": len(faults)} if faults else {})}
     origin = about.origin.model_copy(update=new)
     with reporting(lines.append):
@@ -281,7 +281,7 @@ def _segmented(sight: _Sight, task: Task) -> tuple[Path, list[str]]:
     lines.append(f"{suite} on {about.region}: {counted(made.manifest.queries, 'query', 'queries')} in {made.folder}")
     if faults:
         total = counted(sum(len(query.frames) for query, _ in done.pairs), "picture")
-        failed = f"{sight.loaded.card.name} failed at {len(faults)} of {total}"
+        failed = f"{ready.loaded.card.name} failed at {len(faults)} of {total}"
         lines.append(f"  {failed}, whose evidence is unknown: {'; '.join(faults[:_MOST_SHOWN])}")
     return made.folder, lines
 
@@ -307,23 +307,23 @@ class _Seen:
     pictures: dict[str, Segmented]
 
 
-def _seen_by(sight: _Sight, task: Task, suite: str, faults: list[str]) -> _Seen:
+def _seen_by(ready: _ReadySegmenter, task: Task, suite: str, faults: list[str]) -> _Seen:
     """Segment the pictures of a task; `faults` gets a line for each picture that failed."""
     truths = {item.query_id: item for item in task.truths}
     pairs: list[tuple[Query, Truth]] = []
     pictures: dict[str, Segmented] = {}
-    with SegmenterRun(sight.request, sight.loaded, learned=sight.learned) as run:
-        said = _said(run, task, faults)
-        if sight.is_recalibrated:
-            said = recalibrated(said, read_region(task.root / "regions" / task.folder.name))
-        for query, seen in said:
-            pairs.append(_with_evidence(query, truths[query.query_id], suite, sight.name, seen))
+    with SegmenterRun(ready.request, ready.loaded, learned=ready.learned) as run:
+        segmented = _segmentations(run, task, faults)
+        if ready.is_recalibrated:
+            segmented = recalibrated(segmented, read_region(task.root / "regions" / task.folder.name))
+        for query, seen in segmented:
+            pairs.append(_with_evidence(query, truths[query.query_id], suite, ready.name, seen))
             if seen and seen[-1] is not None:
                 pictures[pairs[-1][0].query_id] = Segmented.of(seen[-1])
     return _Seen(pairs=sorted(pairs, key=lambda pair: pair[0].query_id), pictures=pictures)
 
 
-def _said(run: SegmenterRun, task: Task, faults: list[str]) -> Iterator[Said]:
+def _segmentations(run: SegmenterRun, task: Task, faults: list[str]) -> Iterator[SegmentedQuery]:
     """Yield queries with what the segmenter says of their pictures; `faults` gets a line for each that failed."""
     rows = read_labels(task.truth)
     for query in task.queries():

@@ -25,18 +25,18 @@ def check_segmenter(
     *,
     limits: Limits | None = None,
     images: Sequence[LabelledImage] | None = None,
-    is_shut_in: bool = True,
+    is_sandboxed: bool = True,
 ) -> Iterator[Check]:
     """Try a segmenter, given by name or module:Class, on a few small images; yield a row for each rule.
 
     `images` are `tiny_images` by default; it learns from them, if it learns, and is asked about them. Without
-    `is_shut_in`, trusted code runs without isolation.
+    `is_sandboxed`, trusted code runs without isolation.
     """
     labelled = tuple(tiny_images() if images is None else images)
     with ExitStack() as stack:
         folder = stack.enter_context(scratch_folder("check"))
         paths = write_labelled(folder, labelled)
-        reach = Reach(readable=[folder], hidden=[], is_shut_in=is_shut_in)
+        reach = Reach(readable=[folder], hidden=[], is_sandboxed=is_sandboxed)
         process = stack.enter_context(SegmenterProcess(spec=spec, reach=reach, limits=limits or Limits()))
         asked = {f"image {at}": one.image for at, one in enumerate(labelled)}
         yield from _SegmenterKit(process=process, folder=folder, segmenter=process, images=asked, paths=paths).table()
@@ -76,7 +76,7 @@ class _SegmenterKit(Kit[SegmenterCard, Segmentation, AerialImage]):
             found = "the card needs training, and there is no learned text"
             yield Check(name="answers an image", outcome="not applicable", found=found)
             return
-        yield self.answers(self.images, told=self._told)
+        yield self.answers(self.images, summary=self._summary)
         sound = self.sound(self.images)
         yield self.over("the same answer twice", sound, self.twice)
         yield self.over("the same classes everywhere", sound, lambda label, _: self._classes(label, self.first[label]))
@@ -98,18 +98,18 @@ class _SegmenterKit(Kit[SegmenterCard, Segmentation, AerialImage]):
             and np.array_equal(first.probability_bytes, other.probability_bytes)
         )
 
-    def _told(self) -> str:
-        told = [reply.found for reply in self.first.values() if reply.found is not None]
-        if not told:
+    def _summary(self) -> str:
+        found = [reply.found for reply in self.first.values() if reply.found is not None]
+        if not found:
             return "no answer"
-        silent = np.mean([(each.probability_bytes == SILENT).mean() for each in told])
-        return f"{self.count(len(told))}, {', '.join(told[0].classes)}; silent at {silent:.0%} of the pixels"
+        silent = np.mean([(each.probability_bytes == SILENT).mean() for each in found])
+        return f"{self.count(len(found))}, {', '.join(found[0].classes)}; silent at {silent:.0%} of the pixels"
 
     def _classes(self, label: str, reply: SegmenterReply) -> str | None:
         """Return a fault if an answer tells other classes than that about the first image."""
-        told = next(each.found.classes for each in self.first.values() if each.found is not None)
+        first = next(each.found.classes for each in self.first.values() if each.found is not None)
         found = () if reply.found is None else reply.found.classes
-        return None if found == told else f"{label} tells {', '.join(found)}, the first one {', '.join(told)}"
+        return None if found == first else f"{label} tells {', '.join(found)}, the first one {', '.join(first)}"
 
     def _odd(self, label: str, image: AerialImage) -> str | None:
         reply = self.ask(image)

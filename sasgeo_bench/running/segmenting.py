@@ -55,7 +55,7 @@ class SegmenterProcess(PluginProcess[SegmenterCard, Segmentation]):
     def _found(self, data: bytes) -> Segmentation:
         """Return the segmentation that the bytes are, of the image that was asked about."""
         if self._asked is None:
-            raise MatchError("nobody asked about an image")
+            raise MatchError("unexpected message: no image was requested")
         image, classes = self._asked
         try:
             segmentation = Segmentation.from_bytes(data, shape=image.shape)
@@ -79,7 +79,7 @@ _BYTES[PRESENT], _BYTES[UNKNOWN] = CERTAIN, SILENT
 
 
 def right_segmentation(labelled: LabelledImage) -> Segmentation:
-    """Return the labels of an image as a segmentation: certain, and silent where nobody has looked.
+    """Return the labels of an image as a segmentation: certain, and silent where nothing is labelled.
 
     >>> from sasgeo_bench.sensing.tiny_images import tiny_images
     >>> first = tiny_images()[0]
@@ -104,7 +104,7 @@ class SegmentRequest:
     """A segmenter to ask, by its name or module:Class, and its limits.
 
     All output below `out` is hidden from it: maps, tasks, truths, runs; and `hidden`, files or folders of one's own.
-    `limits.match_s` holds for one image, `limits.learn_s` for all training. Without `is_shut_in`, trusted code runs
+    `limits.match_s` holds for one image, `limits.learn_s` for all training. Without `is_sandboxed`, trusted code runs
     without isolation.
     """
 
@@ -112,7 +112,7 @@ class SegmentRequest:
     out: Path
     limits: Limits = field(default_factory=Limits)
     hidden: Sequence[Path] = ()
-    is_shut_in: bool = True
+    is_sandboxed: bool = True
 
     def reach(self, readable: Sequence[Path] = ()) -> Reach:
         """Return what the segmenter may read: some folders, and nothing else of ours."""
@@ -122,7 +122,7 @@ class SegmentRequest:
         return Reach(
             readable=shown,
             hidden=[part for path in hidden for part in _without(path, shown)],
-            is_shut_in=self.is_shut_in,
+            is_sandboxed=self.is_sandboxed,
         )
 
 

@@ -158,7 +158,7 @@ def _step(tracker: Tracker, query: Query, top_k: int) -> Answer:
 
 
 def _failure(error: Exception, *, plugin: object) -> wire.Message:
-    """Describe an error as an answer; one that nobody foresaw with the last line of the plugin's package on its way."""
+    """Describe an error as an answer; an unforeseen one with the last line of the plugin's package on its way."""
     if isinstance(error, MatchError):
         return {"status": "invalid", "message": one_line(str(error))}
     if isinstance(error, MemoryError):

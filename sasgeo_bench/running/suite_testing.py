@@ -19,11 +19,11 @@ from sasgeo_bench.tasks.build import check_task, make_tasks, plan_draw
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.sampling import Drawer
 from sasgeo_bench.tasks.suites.all_suites import find_suite
-from sasgeo_bench.tasks.suites.base import Draft, Shot, Site, Suite, Variant
-from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests
+from sasgeo_bench.tasks.suites.base import QueryDraft, Site, Suite, Variant, ViewRequest
+from sasgeo_bench.tasks.task_plan import Request, TaskRequest, plan_requests
 
 TOWN: Final = "town-agricultural"  # a square kilometre, built in a second
-_SENTENCES: Final = ("title", "what", "separates", "falsifier")  # of a card: what a reader must be told
+_SENTENCES: Final = ("title", "what", "separates", "falsifier")  # of a card: what a reader needs
 
 
 def check_suite(spec: str, *, out: Path | None = None) -> Iterator[Check]:
@@ -62,7 +62,9 @@ def _lost_role(suite: Suite) -> str | None:
 
 def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
     # 2 sites
-    wanted = Wanted(suites=(spec,), regions=(TOWN,), split="crossfit", count=2, seed=1, out=folder, may_be_fewer=True)
+    wanted = TaskRequest(
+        suites=(spec,), regions=(TOWN,), split="crossfit", count=2, seed=1, out=folder, may_be_fewer=True
+    )
     with reporting(silent):
         (request,) = plan_requests(wanted)
     name = f"draws queries on {TOWN}"
@@ -96,7 +98,7 @@ def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
     )
 
 
-class _AsControl(Shot):
+class _AsControl(ViewRequest):
     @property
     def draw(self) -> tuple[str, ...]:
         return self.variant.others
@@ -118,7 +120,7 @@ class _Kit:
         jobs = [job for job in drawer.jobs(self.sites) if drawer.why_not(job) is None]
         return list(drawer.drawn(jobs))
 
-    def _draft(self, site: Site, variant: Variant, shot: type[Shot] = Shot) -> Draft:
+    def _draft(self, site: Site, variant: Variant, shot: type[ViewRequest] = ViewRequest) -> QueryDraft:
         seeds = self.drawer.seeds.under("site", site.index)
         return self.drawer.suite.draw(shot(scene=self.drawer.scene, site=site, variant=variant, seeds=seeds))
 

@@ -29,7 +29,7 @@ from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice
 from sasgeo_bench.tasks.task_files import query_bytes
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 Outcome = Literal["pass", "fail", "not applicable"]
 AnyCard = TypeVar("AnyCard", MatcherCard, SegmenterCard)
@@ -69,7 +69,7 @@ def tried(rules: Iterable[tuple[str, Callable[[], str | None], str]]) -> Iterato
     for name, rule, found in rules:
         try:
             fault = rule()
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - as said
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - see above
             fault = message_of(error)
         yield check_of(name, fault, found)
 
@@ -200,7 +200,7 @@ class Kit(ABC, Generic[AnyCard, Found, Item]):
     def _untried(self, name: str) -> Check:
         return Check(name=name, outcome="not applicable", found=f"no {self.one.partition(' ')[2]} to try it with")
 
-    def answers(self, items: Mapping[str, Item], *, told: Callable[[], str] = str) -> Check:
+    def answers(self, items: Mapping[str, Item], *, summary: Callable[[], str] = str) -> Check:
         """Ask about every item twice in a row, and keep the answers; report an unsound first answer once."""
         faults = []
         for label, item in items.items():
@@ -212,7 +212,7 @@ class Kit(ABC, Generic[AnyCard, Found, Item]):
                 faults.append(fault)
         number = self.count(len(items))
         return check_of(
-            self.first_rule, f"{faults[0]} ({len(faults)} of {number})" if faults else None, told() or number
+            self.first_rule, f"{faults[0]} ({len(faults)} of {number})" if faults else None, summary() or number
         )
 
     def sound(self, items: Mapping[str, Item]) -> dict[str, Item]:
@@ -279,10 +279,10 @@ class TinyMap:
         """Return the folder of the map."""
         return self.folder / "regions" / self.region.manifest.id
 
-    def worker(self, spec: str, *, limits: Limits | None, is_shut_in: bool) -> Worker:
+    def worker(self, spec: str, *, limits: Limits | None, is_sandboxed: bool) -> Worker:
         """Return a process that may read the map alone."""
         hidden = [(self.folder / name).resolve() for name in ("truth", "tasks")]
-        reach = Reach(readable=[self.map_folder.resolve()], hidden=hidden, is_shut_in=is_shut_in)
+        reach = Reach(readable=[self.map_folder.resolve()], hidden=hidden, is_sandboxed=is_sandboxed)
         return Worker(spec=spec, reach=reach, limits=limits or Limits())
 
 
@@ -324,7 +324,7 @@ def draw(
     folder: Path, town: str, suites: tuple[str, ...], choice: Choice = EVERYTHING
 ) -> tuple[Region, list[tuple[Query, Truth]]]:
     """Build a made-up town and draw a few queries on it; return its map, and the queries with their truths."""
-    wanted = Wanted(
+    wanted = TaskRequest(
         suites=suites,
         regions=(town,),
         split="crossfit",
@@ -347,18 +347,18 @@ def unseen(query: Query) -> Evidence:
 
 
 def check_matcher(
-    spec: str, *, limits: Limits | None = None, place: TinyPlace | None = None, is_shut_in: bool = True
+    spec: str, *, limits: Limits | None = None, place: TinyPlace | None = None, is_sandboxed: bool = True
 ) -> Iterator[Check]:
     """Try a matcher, given by name or module:Class, on a tiny place; yield a row for each rule.
 
-    `place` can be shared by several matchers. Without `is_shut_in`, trusted code runs without isolation, as in
+    `place` can be shared by several matchers. Without `is_sandboxed`, trusted code runs without isolation, as in
     `run --trusted`. Rules about what the card excludes are not applicable. A query without a sound answer counts in the
     first row only.
     """
     with ExitStack() as stack:
         if place is None:
             place = tiny_place(stack.enter_context(scratch_folder("check")))
-        worker = stack.enter_context(place.worker(spec, limits=limits, is_shut_in=is_shut_in))
+        worker = stack.enter_context(place.worker(spec, limits=limits, is_sandboxed=is_sandboxed))
         yield from _MatcherKit(process=worker, folder=place.folder, worker=worker, place=place).table()
 
 

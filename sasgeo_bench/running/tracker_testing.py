@@ -62,17 +62,17 @@ def tiny_flights(path: str | Path) -> TinyFlights:
 
 
 def check_tracker(
-    spec: str, *, limits: Limits | None = None, made: TinyFlights | None = None, is_shut_in: bool = True
+    spec: str, *, limits: Limits | None = None, made: TinyFlights | None = None, is_sandboxed: bool = True
 ) -> Iterator[Check]:
     """Try a tracker, given by name or module:Class, on short flights; yield a row for each rule.
 
     A matcher of single views is tried as it follows flights (`Follower`). `made` can be shared by several trackers.
-    Without `is_shut_in`, trusted code runs without isolation, as in `run --trusted`.
+    Without `is_sandboxed`, trusted code runs without isolation, as in `run --trusted`.
     """
     with ExitStack() as stack:
         if made is None:
             made = tiny_flights(stack.enter_context(scratch_folder("check")))
-        worker = stack.enter_context(made.worker(spec, limits=limits, is_shut_in=is_shut_in))
+        worker = stack.enter_context(made.worker(spec, limits=limits, is_sandboxed=is_sandboxed))
         yield from _TrackerKit(process=worker, folder=made.folder, worker=worker, place=made).table()
 
 
@@ -95,7 +95,7 @@ class _TrackerKit(MapKit[Query]):
             yield Check(name=self.first_rule, outcome="not applicable", found=f"the flights here have {lack}")
             return
         first = self._fly(views)
-        yield check_of(self.first_rule, _fault(first, views), self._told(first))
+        yield check_of(self.first_rule, _fault(first, views), self._summary(first))
         if _fault(first, views) is not None:
             return
         yield _covariances(first)
@@ -142,7 +142,7 @@ class _TrackerKit(MapKit[Query]):
         fault = f"{accepted} of {number} accepted: odometry alone does not tell the place" if accepted else None
         return check_of("accepts nothing where nothing is seen", _fault(replies, views) or fault, number)
 
-    def _told(self, replies: Sequence[Reply]) -> str:
+    def _summary(self, replies: Sequence[Reply]) -> str:
         """Describe how near the estimates are, and how many were accepted."""
         near, accepted, wrong = 0, 0, 0
         for query, reply in zip(self.place.flights[0], replies, strict=False):
@@ -189,9 +189,9 @@ def odd_flights(views: Sequence[Query]) -> dict[str, tuple[Query, ...]]:
 def _stepped(query: Query, increment: tuple[float, float, float] | None, *, sigma: float = 1.0) -> Step:
     """Return the step of a view with another increment, of the given standard deviations; the first view has none."""
     step = query.step or Step(sequence_id=query.query_id, frame=0)
-    told = None if step.frame == 0 else increment
-    covariance = None if told is None else tuple((sigma**2 * np.eye(3)).ravel().tolist())
-    return replace(step, increment=told, covariance=covariance)
+    given = None if step.frame == 0 else increment
+    covariance = None if given is None else tuple((sigma**2 * np.eye(3)).ravel().tolist())
+    return replace(step, increment=given, covariance=covariance)
 
 
 def _fault(replies: Sequence[Reply], views: Sequence[Query]) -> str | None:

@@ -67,10 +67,12 @@ def failed_training(reply: PluginReply[AnyCard, Found]) -> PluginReply[AnyCard, 
     return PluginReply(status=reply.status, message=one_line(f"while learning: {reply.message}"))
 
 
-Said = tuple[Query, Sequence[Segmentation | None]]  # a query and the segmentations of its frames, None where it failed
+SegmentedQuery = tuple[
+    Query, Sequence[Segmentation | None]
+]  # a query and the segmentations of its frames, None where it failed
 
 
-def recalibrated(said: Iterable[Said], region: Region) -> Iterator[Said]:
+def recalibrated(segmented: Iterable[SegmentedQuery], region: Region) -> Iterator[SegmentedQuery]:
     """Yield queries with their segmentations recalibrated together, as those of one flight over the region.
 
     The log-odds of a class are shifted by one number for all pictures, so that its mean probability is its share of
@@ -80,15 +82,15 @@ def recalibrated(said: Iterable[Said], region: Region) -> Iterator[Said]:
     totals: dict[str, NDArray[np.int64]] = {}
     with scratch_folder("seen") as folder:
         queries = []
-        for at, (query, seen) in enumerate(said):
+        for at, (query, seen) in enumerate(segmented):
             queries.append(query)
             for number, one in enumerate(seen):
                 if one is not None:
                     _file(folder, at, number).write_bytes(one.to_bytes())
-                    for told, count in one.counts().items():
-                        totals[told] = totals.get(told, 0) + count
+                    for name, count in one.counts().items():
+                        totals[name] = totals.get(name, 0) + count
         shares = shares_within([query.prior for query in queries], region)
-        tables = tables_of(totals, {told: share for told, share in shares.items() if told in totals})
+        tables = tables_of(totals, {name: share for name, share in shares.items() if name in totals})
         for at, query in enumerate(queries):
             files = (_file(folder, at, number) for number in range(len(query.frames)))
             yield (

@@ -22,7 +22,7 @@ class TooLong(Closed):
     """The other side sends more than is read."""
 
 
-class Late(Exception):  # noqa: N818
+class WireTimeout(Exception):  # noqa: N818
     """Nothing came in time, or the other side does not read."""
 
 
@@ -35,7 +35,7 @@ Message = Mapping[str, Json]
 
 
 def send(channel: socket.socket, message: Message, blob: bytes = b"", *, deadline: float | None = None) -> None:
-    """Send a message; `Closed` if the other side has gone, `Late` if it does not read until a deadline."""
+    """Send a message; `Closed` if the other side has gone, `WireTimeout` if it does not read until a deadline."""
     put(channel, packed(message, blob), deadline=deadline)
 
 
@@ -52,7 +52,7 @@ def put(channel: socket.socket, data: bytes, *, deadline: float | None = None) -
         channel.sendall(data)
         channel.settimeout(None)
     except TimeoutError as error:
-        raise Late from error
+        raise WireTimeout from error
     except OSError as error:
         raise Closed(str(error)) from error
 
@@ -68,7 +68,7 @@ def receive(
         If the other side has gone; `TooLong` if the message is.
     Garbled
         If it is no JSON object, repeats a name, or holds a number that is not finite.
-    Late
+    WireTimeout
         If it did not come in time.
     """
     text_bytes, blob_bytes = _HEAD.unpack(_exactly(channel, _HEAD.size, deadline))
@@ -104,7 +104,7 @@ def _exactly(channel: socket.socket, count: int, deadline: float | None) -> byte
         if deadline is not None:
             left_s = deadline - time.monotonic()
             if left_s <= 0 or not select.select([channel], [], [], left_s)[0]:
-                raise Late
+                raise WireTimeout
         try:
             part = channel.recv(min(count, 2**20))
         except OSError as error:

@@ -36,8 +36,8 @@ from sasgeo_bench.core.texts import (
     one_line,
 )
 from sasgeo_bench.matching.matcher import (
+    MOST_CARD_TEXT,
     MOST_LEARNED_BYTES,
-    MOST_SAID,
     MatcherCard,
     Prediction,
     Status,
@@ -45,7 +45,7 @@ from sasgeo_bench.matching.matcher import (
 )
 from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
-from sasgeo_bench.running.failures import LOG, our_failure, stops_all
+from sasgeo_bench.running.failures import LOG, is_disk_error, our_failure
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
@@ -94,8 +94,8 @@ Reply = PluginReply[MatcherCard, Prediction]  # of a matcher or tracker
 
 
 def _line(text: str) -> str:
-    if not is_line(text, MOST_SAID):
-        raise ValueError(f"must be one line of at most {MOST_SAID} printable characters")
+    if not is_line(text, MOST_CARD_TEXT):
+        raise ValueError(f"must be one line of at most {MOST_CARD_TEXT} printable characters")
     return text
 
 
@@ -103,18 +103,18 @@ Line = Annotated[str, AfterValidator(_line)]
 Seconds = Annotated[float, Field(ge=0, le=MOST_S)]
 
 
-class Strictly(BaseModel):
+class StrictModel(BaseModel):
     """No silent conversion, nothing that is not known, no number that is none."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class _Failed(Strictly):
+class _Failed(StrictModel):
     status: Literal["crash", "invalid", "refused"]
     message: Annotated[Line, Field(max_length=MOST_MESSAGE)]
 
 
-class _Sound(Strictly):
+class _Sound(StrictModel):
     """A sound answer, with the fields of its question (`_FIELDS`)."""
 
     status: Literal["ok"]
@@ -178,7 +178,7 @@ class Reach:
 
     readable: Sequence[Path]
     hidden: Sequence[Path]
-    is_shut_in: bool = True
+    is_sandboxed: bool = True
 
 
 @dataclass(kw_only=True)
@@ -228,7 +228,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         """
         content = dict(given)
         if content.pop("nonce", None) != nonce:
-            raise MatchError("it was not made for this question")
+            raise MatchError("reply does not belong to this query")
         if content.get("status") != "ok":
             failed = checked(_FAILED, content)
             return PluginReply(status=failed.status, message=failed.message)
@@ -283,14 +283,14 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
             answer, data = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
             came = time.perf_counter()
             reply = self._read(kind, answer, data, nonce=nonce)
-        except wire.Late as late:
+        except wire.WireTimeout as late:
             self.end()
             return PluginReply(status="timeout", message=str(late) or f"no answer within {timeout_s:g} s")
         except wire.TooLong as error:
             self.end()
             return PluginReply(status="crash", message=one_line(str(error)))
         except wire.Closed as closed:
-            words = self._last_words(str(closed))
+            words = self._exit_message(str(closed))
             self.end()
             return PluginReply(status="crash", message=words)
         except (MatchError, wire.Garbled) as error:
@@ -309,7 +309,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         self.end()
         ours, theirs = socket.socketpair()
         self._scratch = self._kept.enter_context(scratch_folder(self.door))
-        command = _command(theirs.fileno(), is_shut_in=self.reach.is_shut_in)
+        command = _command(theirs.fileno(), is_sandboxed=self.reach.is_sandboxed)
         self._process = subprocess.Popen(  # noqa: S603 - our own module, by our own interpreter
             command,
             pass_fds=[theirs.fileno()],
@@ -326,7 +326,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         self._drain.start()
         self._channel = ours
         self.starts += 1
-        if self.reach.is_shut_in:
+        if self.reach.is_sandboxed:
             wire.send(ours, asdict(self._policy(str(self._scratch))))
             self.isolation = self._started_isolation(ours)
         self.isolation["memory"] = _memory_words(self.limits, self._group)
@@ -339,8 +339,8 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         """Return how the sandbox isolates; a late one is no fault of the matcher, and its message says so."""
         try:
             started, _ = wire.receive(channel, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
-        except wire.Late:
-            raise wire.Late(
+        except wire.WireTimeout:
+            raise wire.WireTimeout(
                 f"the sandbox did not stand within {_START_S:g} s: is a folder of sys.path very large?"
             ) from None
         return {str(name): one_line(str(text)) for name, text in dict(started["isolation"]).items()}
@@ -380,7 +380,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         code = _code()
         scan = walk_code(code)
         found = scan.hidden([*code, *self.reach.readable])
-        packed = sorted(shipped_dir("pipelines").glob(f"*{PACKED}"))  # answers; nobody walks what is installed
+        packed = sorted(shipped_dir("pipelines").glob(f"*{PACKED}"))  # answers; what is installed is not walked
         hidden = [*map(str, (*self.reach.hidden, *packed)), *(path for path in found if not self._is_lesson(path))]
         return sandbox.Policy(
             readable=[str(path) for path in (*code, *self.reach.readable)],
@@ -396,7 +396,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         """Return whether a file is a labelled image in a folder that the plugin may read, to learn from it."""
         return path.endswith(LABELLED) and Path(path).parent in self.reach.readable
 
-    def _last_words(self, closed: str) -> str:
+    def _exit_message(self, closed: str) -> str:
         """Describe how a process ended, with the last line it printed."""
         code = None
         with contextlib.suppress(subprocess.TimeoutExpired):  # on a busy machine an end takes its time
@@ -457,7 +457,7 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
         end already, is replaced, and prepares the map again.
         """
         if self._process is not None and self._is_gone():
-            words = self._last_words("ended between two questions")
+            words = self._exit_message("ended between two questions")
             self.end()
             return PluginReply(status="crash", message=words)
         if self._process is None and self._region is not None:
@@ -483,7 +483,7 @@ def guarded(ask: Callable[[], PluginReply[AnyCard, Found]], folder: Path, name: 
     except StoreError:
         raise
     except Exception as error:
-        if stops_all(error):
+        if is_disk_error(error):
             raise StoreError(
                 f"no process of a plugin can be started ({message_of(error)}): free some space and run again"
             ) from error
@@ -521,8 +521,8 @@ def _environment(scratch: Path) -> dict[str, str]:
     return {**kept, **threads, **own, "PYTHONDONTWRITEBYTECODE": "1", "PYDANTIC_DISABLE_PLUGINS": "__all__"}
 
 
-def _command(channel: int, *, is_shut_in: bool) -> list[str]:
-    if not is_shut_in:
+def _command(channel: int, *, is_sandboxed: bool) -> list[str]:
+    if not is_sandboxed:
         return [sys.executable, *_ANSWERS, str(channel)]
     package = str(Path(sasgeo_bench.running.child.__file__).parents[2])
     return [sys.executable, "-I", "-S", "-c", PROGRAM, package, *_ANSWERS, str(channel)]

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.raster import doubted
+from sasgeo_bench.sasgeo.raster import with_unknown_margins
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import Gains, even_gains, likelihood_gains
 
@@ -48,7 +48,7 @@ class Switches:
         if not self.is_unknown_silent:
             cells = np.where(evidence.cells == UNKNOWN, ABSENT, evidence.cells).astype(np.uint8)
             evidence = Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
-        return doubted(evidence)
+        return with_unknown_margins(evidence)
 
     def gains(self, model: ScorerModel, *, age_years: float, season: str = "") -> Gains:
         """Return the gains of Eq. 7 for the age of a map and a season, in the order of the classes of the model."""

@@ -229,7 +229,7 @@ class _Stage:
     """A view at a pose: its nodes on the map, map nodes around, and the (negative) scores of unmatched nodes.
 
     `around` are rows of the map nodes; `is_judged` leaves out patches that reach beyond the view, of which the place
-    and the area depend on what nobody sees.
+    and the area depend on what is out of view.
     """
 
     pose: Pose

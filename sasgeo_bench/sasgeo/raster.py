@@ -158,7 +158,7 @@ def _share(
 DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same
 
 
-def doubted(evidence: Evidence) -> Evidence:
+def with_unknown_margins(evidence: Evidence) -> Evidence:
     """Return a view with absent cells near a seen line as unknown: a line mapped there may be the same.
 
     This complements the distance transform of the map in `likeness_by_hand`.

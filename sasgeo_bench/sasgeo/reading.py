@@ -22,7 +22,7 @@ from sasgeo_bench.sasgeo.joint import columns
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, doubted, read_field
+from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, read_field, with_unknown_margins
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
@@ -245,7 +245,7 @@ class Reading:
         if vectors is None or not self.reader.switches.burns_vectors:
             return None
         drawn = burnt(vectors, self.query.evidence)
-        return None if drawn is None else doubted(drawn)
+        return None if drawn is None else with_unknown_margins(drawn)
 
     @cached_property
     def template(self) -> Template:

@@ -148,15 +148,15 @@ _USUAL_M: Final = 50.0  # between two views, where no odometer says it
 class SasgeoTrack:
     """The scorer's raster over time, with the parts that `switches` and `over_time` select.
 
-    `temper` is the share of the fitted exponents that a view of new ground has, `doubt` the probability that a view
-    fits no place.
+    `exponent_scale` is the share of the fitted exponents that a view of new ground has, `outlier_probability` that of
+    views    fits no place.
     """
 
     card: MatcherCard
     switches: ClassVar[Switches] = Switches(has_graph=False, correlates=False)
     over_time: ClassVar[OverTime] = OverTime()
-    temper: float = FRESH
-    doubt: float = NONE
+    exponent_scale: float = FRESH
+    outlier_probability: float = NONE
 
     def __init__(self) -> None:
         self._reader: Reader | None = None
@@ -229,16 +229,18 @@ class SasgeoTrack:
     def _seen(self, belief: GridBelief, query: Query) -> GridBelief:
         """Weigh the belief by a view, learn the flight's scale, and mind whether the view fits better elsewhere."""
         template = self._map.read(query).template
-        weight = self.temper * min(1.0, self._new_m / template.side_m)  # ground seen before says nothing new of the map
+        weight = self.exponent_scale * min(
+            1.0, self._new_m / template.side_m
+        )  # ground seen before says nothing new of the map
         self._new_m = 0.0
-        doubt = self.doubt if self.over_time.has_none else 0.0
+        outlier_probability = self.outlier_probability if self.over_time.has_none else 0.0
         scored = _Scored(field=self._map.field, template=template, scale=self._scale.mean, weight=weight)
         # Mean place of a belief
         plane = belief.mass.sum(axis=0, dtype=np.float64).ravel()
         east_m, north_m = (plane @ belief.places_m / plane.sum()).tolist()
         average = scored.of_average((east_m, north_m))
         logs = scored.on(belief, elsewhere=average)
-        weighed = belief.weighed(logs, doubt=doubt)
+        weighed = belief.weighed(logs, outlier_probability=outlier_probability)
         fix = fix_of(weighed, least=LEAST)
         if fix.pose is None:
             return weighed
@@ -270,7 +272,7 @@ class SasgeoTrack:
             rival = _Rival(belief=GridBelief.of(near, self._map.field.grid))
         theirs = logs_on(rival.belief)
         lead_nats += rival.lead_nats + _evidence(rival.belief, theirs)
-        found = rival.belief.weighed(theirs, doubt=self.doubt).fitted()
+        found = rival.belief.weighed(theirs, outlier_probability=self.outlier_probability).fitted()
         if lead_nats > 6.0 and fix_of(found, least=LEAST).is_accepted:  # nats: more evidence than the belief has
             self._rival, self._doubts, self._lost_m = None, 0, LOST_M
             return found
@@ -298,7 +300,7 @@ class _Scored:
     def on(self, belief: GridBelief, *, elsewhere: float) -> Floats:
         """Return the scores at the headings in `belief.asked` and each cell of its window."""
         # Of a cell that the map does not know nothing is known: there a view scores `elsewhere`.
-        logs = surface_logs(self.field, self.template, belief, temper=self.weight, scale=self.scale)
+        logs = surface_logs(self.field, self.template, belief, exponent_scale=self.weight, scale=self.scale)
         known = known_on(self.field, belief.grid)
         return np.asarray(known * logs + (1 - known) * np.float32(elsewhere))
 

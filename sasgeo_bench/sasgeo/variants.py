@@ -18,7 +18,7 @@ from sasgeo_bench.sasgeo.conformal import levels_of
 from sasgeo_bench.sasgeo.graph import GraphScore
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
 from sasgeo_bench.sasgeo.learning import learn
-from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, doubted, likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, likeness_by_hand, read_field, with_unknown_margins
 from sasgeo_bench.sasgeo.rates import hand_rates
 from sasgeo_bench.sasgeo.reading import Reader, Reading
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
@@ -81,7 +81,7 @@ def view_by_hand(query: Query, classes: Sequence[str], *, map_date: dt.date) -> 
     age_years = max(0.0, (query.observed_on - map_date).days / _DAYS_PER_YEAR)
     rates = [hand_rates(name) for name in classes]
     gains = likelihood_gains(rates, age_years=age_years, persists=by_hand(query.season, classes).tolist())
-    view = RasterView.of(doubted(query.evidence), classes, gains)
+    view = RasterView.of(with_unknown_margins(query.evidence), classes, gains)
     return view.times(np.float32(query.evidence.cell_size_m**2)).template()
 
 

@@ -417,7 +417,7 @@ def best_value(
 ) -> float:
     """Return the best value that a first side can have; NaN where it is not known.
 
-    `ceiling` is the share of right answers that nobody can exceed. For a difference (`LESS`) it is less what the first
+    `ceiling` is the share of right answers that none can exceed. For a difference (`LESS`) it is less what the first
     side reaches on the `control`. For "aurc" the best is the area of a perfect order where a share r of many answers is
     false, r + (1 - r) ln(1 - r) (Geifman et al., ICLR 2019).
 

@@ -98,7 +98,7 @@ class Contrast:
         return ", ".join(f"{name} {', '.join(values)}" for name, values in chosen.items() if values)
 
 
-def hold_contrasts(
+def evaluate_contrasts(
     contrasts: Sequence[Contrast],
     scores: Mapping[str, pd.DataFrame],
     rejections: Mapping[tuple[str, str], pd.DataFrame],
@@ -195,7 +195,7 @@ def by_place(
 ) -> tuple[PlaceDifference, ...]:
     """Return the difference of a contrast at each place, by name; exploratory, not part of the registered test.
 
-    Parameters and errors are those of `hold_contrasts`; blocks are resampled within each place.
+    Parameters and errors are those of `evaluate_contrasts`; blocks are resampled within each place.
     """
     first, second = _pair(contrast, scores, rejections)
     places = first["place"].to_numpy(str)

@@ -16,7 +16,7 @@ from sasgeo_bench.scoring.contrasts import PRIMARY, Contrast, both_on, mean_find
 from sasgeo_bench.scoring.frames import MATCHER, Column, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.scoring.metrics import is_present, primary_of
-from sasgeo_bench.scoring.rows import UNRANKED, name_alone
+from sasgeo_bench.scoring.rows import UNRANKED, base_name
 from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
 
@@ -62,7 +62,7 @@ class Verdict:
         >>> [Verdict(matcher=name, **same).is_of_board for name in names]
         [True, True, False]
         """
-        return name_alone(self.matcher) in {ORACLE, REFERENCE, *UNRANKED}
+        return base_name(self.matcher) in {ORACLE, REFERENCE, *UNRANKED}
 
     @property
     def fails_at(self) -> int | None:
@@ -104,7 +104,7 @@ def is_control(scores: pd.DataFrame) -> Bools:
     return (scores["suite"] == CONTROLS).to_numpy(bool)
 
 
-def hold_controls(scored: Mapping[str, pd.DataFrame]) -> tuple[Verdict, ...]:
+def evaluate_controls(scored: Mapping[str, pd.DataFrame]) -> tuple[Verdict, ...]:
     """Check every control of each matcher that answered it.
 
     `scored` holds all scored rows by matcher, including the suite `controls`.
@@ -112,7 +112,7 @@ def hold_controls(scored: Mapping[str, pd.DataFrame]) -> tuple[Verdict, ...]:
     verdicts: list[Verdict] = []
     for matcher, frame in scored.items():
         asked = frame[~frame["status"].isin((MISSING, NOT_APPLICABLE))]
-        name = name_alone(matcher)
+        name = base_name(matcher)
         if name == ORACLE:
             verdicts += _perfect(matcher, asked)
             continue
@@ -129,11 +129,11 @@ def failed_controls(verdicts: Sequence[Verdict], matcher: str) -> tuple[Verdict,
     return tuple(item for item in verdicts if item.matcher == matcher and not (item.holds or item.is_of_board))
 
 
-def knows_too_much(verdicts: Sequence[Verdict], matcher: str) -> str | None:
+def reason_implausible(verdicts: Sequence[Verdict], matcher: str) -> str | None:
     """Return why the answers of an entry cannot come from the view and the map alone; None if they can.
 
     >>> one = Verdict(control=_AT_CHANCE[TWINS], matcher="mine", n=24, found=24.0, expected=12.0, p=6e-8, holds=False)
-    >>> knows_too_much([one], "mine")
+    >>> reason_implausible([one], "mine")
     'right 24 of 24 times at the control "identical twins tie", where guessing is right 12 times'
     """
     for item in failed_controls(verdicts, matcher):
@@ -250,7 +250,7 @@ class Falsifier:
         return "loss without the stress" if found.hi < 0 else "no gain shown"
 
 
-def hold_falsifiers(
+def evaluate_falsifiers(
     contrasts: Sequence[Contrast], scores: Mapping[str, pd.DataFrame], *, draws: int = DRAWS
 ) -> tuple[Falsifier, ...]:
     """Compare the methods of each contrast by success or recall on controls and falsifiers of its suites.
@@ -287,7 +287,7 @@ def _unstressed(frame: pd.DataFrame) -> "pd.Series[bool]":
     return frame["is_present"].astype(bool) & (frame["role"] != "stress") & (frame["unknown_share"] < 1)
 
 
-_TOLD: Final = (
+_CONTRAST_COLUMNS: Final = (
     *("first", "second", "first_value", "second_value", "difference", "lo", "hi", "lo_blocks", "hi_blocks"),
     *("n", "blocks", "places", "first_only", "second_only"),
 )
@@ -295,7 +295,7 @@ FALSIFIER_SCHEMA: Final = Schema(
     "falsifiers",
     (
         *row_columns(Falsifier)[:3],
-        *(replace(CONTRAST_SCHEMA[name], source=f"finding.{name}") for name in _TOLD),
+        *(replace(CONTRAST_SCHEMA[name], source=f"finding.{name}") for name in _CONTRAST_COLUMNS),
         Column("verdict", str, "Whether the first gains where it should not"),
     ),
 )

@@ -21,7 +21,7 @@ from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import RUN, Answers, CardRecord, RunManifest, StoredAnswers, damaged
-from sasgeo_bench.scoring.controls import Verdict, hold_controls, knows_too_much
+from sasgeo_bench.scoring.controls import Verdict, evaluate_controls, reason_implausible
 from sasgeo_bench.scoring.flights import score_flights
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, PACKED, RUN_HERE, is_unranked
 from sasgeo_bench.scoring.score import Questions, settle_not_applicable, some_rows, with_answers
@@ -307,7 +307,7 @@ def set_apart(
         places = sorted(set(_overlaps(entry, scores[entry.name], split)))
         what = places[0] if len(places) == 1 else named(places, "place")
         trained = f"trained on {what}, which it is tested on" if places else None
-        reasons = [reason for reason in (knows_too_much(verdicts, entry.name), trained) if reason]
+        reasons = [reason for reason in (reason_implausible(verdicts, entry.name), trained) if reason]
         if reasons:
             found[entry.name] = "; ".join(reasons)
             tell(f"{entry.name}: set apart, {found[entry.name]}")
@@ -490,9 +490,9 @@ def _read_runs(
 
 def _share_of(run: RunManifest, answers: Answers) -> RunManifest:
     """Return the run record with CPU time scaled to the fraction of answers that count."""
-    if not answers.aside or run.cpu_s is None:
+    if not answers.excluded or run.cpu_s is None:
         return run
-    return run.model_copy(update={"cpu_s": run.cpu_s * len(answers.table) / (len(answers.table) + answers.aside)})
+    return run.model_copy(update={"cpu_s": run.cpu_s * len(answers.table) / (len(answers.table) + answers.excluded)})
 
 
 def open_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: Path) -> list[Task]:
@@ -508,7 +508,7 @@ def open_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Contest:
+class ScoredEntries:
     """Entries with their answers, the tasks, and all scored rows by entry, including those of controls.
 
     `views` are the rows of the views of flights by entry (`flights.view_frame`), of entries that were asked any.
@@ -528,7 +528,7 @@ def score_entries(
     by_region: Collection[str],
     by_block: Collection[str] = (),
     failures: Failures,
-) -> Contest:
+) -> ScoredEntries:
     """Score the answers of all entries; `failures` records entries that cannot be scored, and they are left out.
 
     `split` assigns blocks to places. Suites in `by_region` are resampled by region instead of by block; in suites of
@@ -551,17 +551,17 @@ def score_entries(
     for name, listed in parts.items():
         with failures.of(name):
             scored = settle_not_applicable(_joined(listed, shared))
-            hold_controls({name: scored})  # so that an error names the entry
+            evaluate_controls({name: scored})  # so that an error names the entry
             scores[name] = scored
             seen = [part.views for part in listed if part.views is not None]
             views |= {name: pd.concat(seen, ignore_index=True)} if seen else {}
     if not scores and failures.first is not None:
         raise failures.first
     left = tuple(item for item in answers if item.entry.name in scores)
-    return Contest(answers=left, tasks=tuple(tasks), scores=scores, views=views)
+    return ScoredEntries(answers=left, tasks=tuple(tasks), scores=scores, views=views)
 
 
-def scored_rows(contest: Contest, split: Split | None) -> dict[str, pd.DataFrame]:
+def scored_rows(contest: ScoredEntries, split: Split | None) -> dict[str, pd.DataFrame]:
     """Return by entry the scored rows of the suites of which it was asked every task, without those of controls.
 
     Train places of a hold-out `split` do not count. Entries without such a suite are missing, with a line

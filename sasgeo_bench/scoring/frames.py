@@ -22,7 +22,7 @@ class Shown(NamedTuple):
 
 
 MATCHER: Final = Shown(
-    "Name of the entry. Controls have no rank: they show what a figure means that nobody earned",
+    "Name of the entry. Controls have no rank: they are references for reading the figures",
 )
 REJECTOR: Final = Shown(
     "Estimates of each answer how likely it is false; own: the matcher's own confidence, fitted to nothing",
@@ -51,10 +51,10 @@ class Column:
     @classmethod
     def of(cls, name: str, kind: object) -> Self:
         """Return the column of a field whose type may be annotated with a meaning, or with `Shown`."""
-        found, said = get_args(kind)[:2] if get_origin(kind) is Annotated else (kind, "")
-        if isinstance(said, Shown):
-            return cls(name, found, said.meaning, said.head or name)
-        return cls(name, found, said)
+        found, shown = get_args(kind)[:2] if get_origin(kind) is Annotated else (kind, "")
+        if isinstance(shown, Shown):
+            return cls(name, found, shown.meaning, shown.head or name)
+        return cls(name, found, shown)
 
     def holds(self, values: "pd.Series[Any]") -> bool:
         """Return whether a column of a table is of this kind."""

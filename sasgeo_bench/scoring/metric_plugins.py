@@ -17,7 +17,7 @@ from sasgeo_bench.core.plugins import METRICS as GROUP
 from sasgeo_bench.core.plugins import check_own_name, code_of, find_inside, list_entry_points, plugin_code
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import is_line, message_of, one_line, typed
-from sasgeo_bench.matching.matcher import MOST_SAID, numbers_of
+from sasgeo_bench.matching.matcher import MOST_CARD_TEXT, numbers_of
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.metric import MeanMetric, Metric
 from sasgeo_bench.scoring.metrics import METRICS, TRACKS
@@ -106,8 +106,8 @@ def _silence(metric: MeanMetric) -> str | None:
     are_tracks = bool(tracks) and all(isinstance(track, str) and track in TRACKS for track in tracks)
     faults = {
         f"it is named {metric.name!r}, as a column of boards: rename it": metric.name in COLUMNS,
-        f"its {blank} is {_shown(getattr(metric, str(blank), ''))}, expected a line of text, {MOST_SAID} characters "
-        "at most": blank is not None,
+        f"its {blank} is {_shown(getattr(metric, str(blank), ''))}, expected a line of text, {MOST_CARD_TEXT} "
+        "characters at most": blank is not None,
         f"better is {_shown(metric.better)}, expected 'higher' or 'lower'": not is_better,
         f"bounds are {_shown(metric.bounds)}, expected the least and the greatest value, as in "
         "(0.0, 1.0)": not _are_bounds(metric.bounds),
@@ -124,7 +124,7 @@ def _shown(value: object) -> str:
 
 
 def _is_line(value: object) -> bool:
-    return isinstance(value, str) and bool(value.strip()) and is_line(value, MOST_SAID)
+    return isinstance(value, str) and bool(value.strip()) and is_line(value, MOST_CARD_TEXT)
 
 
 def _are_bounds(given: object) -> bool:
@@ -142,11 +142,11 @@ def values_of(metric: MeanMetric, scores: pd.DataFrame) -> Floats:
     It is given a copy. Raise `MetricError` if it fails, or a value is no number, or out of bounds.
     """
     rows = scores.reset_index(drop=True)
-    said = _asked(metric.values, rows, "values")
+    found = _asked(metric.values, rows, "values")
     counts = _asked(metric.counts, rows, "counts")
     if counts.dtype != bool:
         raise MetricError(f"its counts are of type {counts.dtype}, expected bool")
-    values = np.where(counts, said.astype(float), np.nan)
+    values = np.where(counts, found.astype(float), np.nan)
     low, high = map(float, metric.bounds)
     wrong = np.isinf(values) | (values < low - _SLACK) | (values > high + _SLACK)
     if wrong.any():

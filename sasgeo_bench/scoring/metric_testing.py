@@ -58,8 +58,8 @@ def check_metric(spec: str, *, out: Path | None = None) -> Iterator[Check]:
         yield Check(name=name, outcome="fail", found=str(error))
         return
     low, high = metric.bounds
-    said = f"{metric.name}: {metric.better} is better, {low:g} to {high:g}, unit {metric.unit}"
-    yield Check(name=name, outcome="pass", found=said)
+    summary = f"{metric.name}: {metric.better} is better, {low:g} to {high:g}, unit {metric.unit}"
+    yield Check(name=name, outcome="pass", found=summary)
     if not isinstance(metric, MeanMetric):
         yield Check(name="a mean over queries", outcome="not applicable", found="it is a metric of another kind")
         return
@@ -186,7 +186,7 @@ NEAR_M, FAR_M = 5.0, 50.0
 
 
 def values(scores: pd.DataFrame) -> np.ndarray:
-    """Return a number for each row of scores.parquet; NaN leaves a query out, whoever answered it."""
+    """Return a number for each row of scores.parquet; NaN leaves a query out, whichever method answered it."""
     error_m = scores["position_error_m"].to_numpy(float)  # infinite without an answer, which so scores 0
     near = np.clip((FAR_M - error_m) / (FAR_M - NEAR_M), 0.0, 1.0)
     return np.where(scores["is_present"], near, np.nan)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure the confusions of a segmenter from its counts of pixels: a profile that views can be drawn with.
 
-False alarms are told apart by what lies there: ground without any class, or each other class. A precision alone would
+False alarms are split by what lies there: ground without any class, or each other class. A precision alone would
 change with how common the class is; these rates do not.
 """
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from sasgeo_bench.core.errors import MetricError, named
 from sasgeo_bench.scoring.base import Floats
-from sasgeo_bench.scoring.segmentation import PixelCounts, precision, recall_said, told_classes
+from sasgeo_bench.scoring.segmentation import PixelCounts, precision, predicted_classes, recall_where_known
 from sasgeo_bench.tasks.perturbations.perception_profile import ClassConfusions, PerceptionProfile
 
 _LEAST_SHARE: Final = 0.0005  # rarer confusions are left out
@@ -26,7 +26,7 @@ def measure_profile(counts: Sequence[PixelCounts], *, segmenter: str, learned_fr
     counts : sequence of PixelCounts
         One for each image; all label the same classes.
     segmenter, learned_from : str
-        What the profile says of itself, beside the places of the images.
+        What the profile says of itself, and the places of the images.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def measure_profile(counts: Sequence[PixelCounts], *, segmenter: str, learned_fr
 
     Notes
     -----
-    Only pixels of which something is said count: silence is no error, and a view is made unknown by other means. Lines
+    Only pixels with a prediction count: silence is no error, and a view is made unknown by other means. Lines
     are scored without the cell of tolerance that the detector "measured" has, so their rates are worse than on a map.
 
     Examples
@@ -55,14 +55,14 @@ def measure_profile(counts: Sequence[PixelCounts], *, segmenter: str, learned_fr
     classes = counts[0].classes if counts else ()
     if not counts or any(one.classes != classes for one in counts):
         raise MetricError("a profile is measured on images that all label the same classes, and on one at least")
-    told = told_classes(counts)
+    predicted = predicted_classes(counts)
     shares = {key: _shares(counts, key) for key in ("instead", "besides")}
     found = {}
-    for name in told:
+    for name in predicted:
         total = np.sum([one.of_class(name) for one in counts], axis=0).astype(np.float64)
-        said = int(total[1, :-1].sum())
-        if said:
-            found[name] = _of_class(name, classes, total, shares).model_copy(update={"pixels": said})
+        pixels = int(total[1, :-1].sum())
+        if pixels:
+            found[name] = _of_class(name, classes, total, shares).model_copy(update={"pixels": pixels})
     if not found:
         raise MetricError(
             f"no class that {segmenter} tells is there in {named([one.image for one in counts], 'image')}"
@@ -75,7 +75,7 @@ def measure_profile(counts: Sequence[PixelCounts], *, segmenter: str, learned_fr
 def _of_class(name: str, classes: tuple[str, ...], total: Floats, shares: dict[str, Floats]) -> ClassConfusions:
     """Return the rates of one class; `total` has shape (2, 256), the shares have shape (C + 1, C)."""
     at = classes.index(name)
-    recall, right = float(recall_said(total)), float(np.nan_to_num(precision(total)))
+    recall, right = float(recall_where_known(total)), float(np.nan_to_num(precision(total)))
     called, also = (
         {other: share for other, share in zip(classes, shares[key][at].tolist(), strict=True) if share >= _LEAST_SHARE}
         for key in ("instead", "besides")

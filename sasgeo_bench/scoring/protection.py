@@ -231,7 +231,7 @@ def _levels_of_group(
             sites=sites[counts],
         )
 
-    found = _told(group, predictions, [SCALE, *(level_name(method, risk) for risk in RISKS for method in METHODS)])
+    found = _reported(group, predictions, [SCALE, *(level_name(method, risk) for risk in RISKS for method in METHODS)])
     scale_m = found[SCALE]
     for risk in RISKS:
         for method in METHODS:
@@ -242,12 +242,12 @@ def _levels_of_group(
             yield of(CONFORMAL, risk, *_conformal(group, split, scale_m, error_m, risk))
 
 
-def _told(group: pd.DataFrame, predictions: Mapping[str, Prediction], names: Sequence[str]) -> dict[str, Floats]:
+def _reported(group: pd.DataFrame, predictions: Mapping[str, Prediction], names: Sequence[str]) -> dict[str, Floats]:
     """Return levels or scales in each answer's diagnostics, by name; infinite if missing or not positive."""
     answered = zip(group["query_id"], group["is_answered"], strict=True)
     levels = [
-        [told.get(name, np.inf) for name in names]
-        for told in (predictions[query].diagnostics if some else {} for query, some in answered)
+        [reported.get(name, np.inf) for name in names]
+        for reported in (predictions[query].diagnostics if some else {} for query, some in answered)
     ]
     values = np.array(levels, dtype=np.float64).reshape(-1, len(names))
     return dict(zip(names, np.where(values > 0, values, np.inf).T, strict=True))

@@ -28,7 +28,7 @@ from sasgeo_bench.scoring.score import MISSING
 ALL_SUITES: Final = "all suites"
 AS_SUBMITTED: Final = "as submitted"  # source of the answers: their author,
 RUN_HERE: Final = "run here"  # our run of the code, on queries of a public seed only,
-PACKED: Final = "answers came packed"  # in an archive beside a pipeline file: nobody here has asked for them,
+PACKED: Final = "answers came packed"  # in an archive beside a pipeline file: not asked for here,
 REPRODUCED: Final = "reproduced"  # or of a private seed too, where it is not shown to be worse,
 NOT_REPRODUCED: Final = "not reproduced"  # or is shown to be worse
 UNRANKED: Final = frozenset(  # controls: not ranked
@@ -135,7 +135,7 @@ class Row(RowKey):
         float,
         Shown(
             "Smallest difference from the best other matcher that so many places can show (5 %, power 80 %); inf if "
-            "none, - where nobody is ranked"
+            "none, - where no entry is ranked"
         ),
     ] = math.nan
 
@@ -158,10 +158,10 @@ def in_threads(
     return rows
 
 
-def name_alone(matcher: str) -> str:
+def base_name(matcher: str) -> str:
     """Return the name of an entry without the version and hash that tell it from another of its name.
 
-    >>> name_alone("random 1 (c85212)"), name_alone("random")
+    >>> base_name("random 1 (c85212)"), base_name("random")
     ('random', 'random')
     """
     return matcher.partition(" ")[0]
@@ -173,7 +173,7 @@ def is_unranked(matcher: str) -> bool:
     >>> is_unranked("oracle_pose 1 (c85212)"), is_unranked("raster_uniform")
     (True, False)
     """
-    name = name_alone(matcher)
+    name = base_name(matcher)
     return name in UNRANKED or name.startswith(YARDSTICK)
 
 
@@ -197,7 +197,7 @@ LEADERBOARD_SCHEMA: Final = Schema(
     (
         FIGURE_SCHEMA["matcher"],
         *row_columns(EntryLabel)[:3],
-        Column("is_control", bool, "It shows what a figure means that nobody earned, and has no rank"),
+        Column("is_control", bool, "It is a reference for reading the figures, and has no rank"),
         *row_columns(EntryLabel)[3:],
         *FIGURE_SCHEMA.columns[1:],
     ),
@@ -218,10 +218,10 @@ def with_entry_labels(board: pd.DataFrame, contestants: Mapping[str, EntryLabel]
     return board.assign(**texts, is_control=is_control, set_apart=set_apart)[list(LEADERBOARD_SCHEMA.names)]
 
 
-def is_apart(board: pd.DataFrame) -> "pd.Series[bool]":
+def is_set_apart(board: pd.DataFrame) -> "pd.Series[bool]":
     """Return a mask of the rows that are excluded from ranks; all False if the table has no such column.
 
-    >>> is_apart(pd.DataFrame({"matcher": ["mine"], "set_apart": ["trained on vaduz"]})).tolist()
+    >>> is_set_apart(pd.DataFrame({"matcher": ["mine"], "set_apart": ["trained on vaduz"]})).tolist()
     [True]
     """
     if "set_apart" not in board:

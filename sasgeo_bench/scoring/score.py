@@ -27,7 +27,7 @@ RETRIEVAL: Final = "retrieval"  # the track
 class Score:
     """One scored query of one matcher.
 
-    What a column says of the query, of the truth or of the prediction is said there.
+    What a column says of the query, of the truth or of the prediction is stated there.
     """
 
     query_id: Annotated[str, "Id of the query"]

@@ -45,7 +45,7 @@ class PixelCounts:
     instead, besides, asked : ndarray of int64, shape (C + 1, C)
         Confusions of what is there (rows; the last is ground, where every class is known to be absent) with what is
         seen wrongly (columns): the column's class instead of the row's, or besides it, of the pixels that are asked
-        about: the row's class is there, the column's is not, and something is said of both. The diagonal is 0.
+        about: the row's class is there, the column's is not, and both have a prediction. The diagonal is 0.
 
     Examples
     --------
@@ -78,7 +78,9 @@ class PixelCounts:
         for at, name in enumerate(labelled.classes):
             if name in found.classes:
                 bytes_[at] = found.probability_bytes[found.classes.index(name)]
-        pixels = np.stack([_by_byte(said, labels) for said, labels in zip(bytes_, labelled.labels, strict=True)])
+        pixels = np.stack(
+            [_by_byte(predicted, labels) for predicted, labels in zip(bytes_, labelled.labels, strict=True)]
+        )
         instead, besides, asked = _confusions(bytes_, labelled.labels)
         return cls(
             image=image,
@@ -96,18 +98,18 @@ class PixelCounts:
         return self.pixels[self.classes.index(name)] if name in self.classes else np.zeros((2, BYTES), dtype=np.int64)
 
 
-def _by_byte(said: np.ndarray, labels: np.ndarray) -> Ints:
+def _by_byte(predicted: np.ndarray, labels: np.ndarray) -> Ints:
     """Count the bytes where a class is absent and where it is present, shape (2, 256)."""
-    return np.stack([np.bincount(said[labels == state], minlength=BYTES) for state in (ABSENT, PRESENT)])
+    return np.stack([np.bincount(predicted[labels == state], minlength=BYTES) for state in (ABSENT, PRESENT)])
 
 
-def _confusions(said: np.ndarray, labels: np.ndarray) -> tuple[Ints, Ints, Ints]:
+def _confusions(predicted: np.ndarray, labels: np.ndarray) -> tuple[Ints, Ints, Ints]:
     """Count confusions, shape (C + 1, C) each; see `PixelCounts`."""
     # Classes are few and pixels many: one matrix product of pixels' states counts all pairs of classes.
-    flat, truth = said.reshape(len(said), -1), labels.reshape(len(labels), -1)
+    flat, truth = predicted.reshape(len(predicted), -1), labels.reshape(len(labels), -1)
     spoken = flat != SILENT
     seen = spoken & (flat >= SEEN)
-    labelled = (truth != UNKNOWN).any(axis=1)  # a class that nobody has looked for hides no ground
+    labelled = (truth != UNKNOWN).any(axis=1)  # a class that is not labelled hides no ground
     ground = (truth[labelled] == ABSENT).all(axis=0) & labelled.any()
     rows = np.concatenate(((truth == PRESENT) & spoken, ground[None]))
     missed = np.concatenate(((truth == PRESENT) & spoken & ~seen, ground[None]))
@@ -165,7 +167,7 @@ def _read(part: pd.DataFrame) -> PixelCounts:
 
 DRAWS: Final = 1000  # of the bootstrap: percentiles of images need no more, and each draw is 512 counts
 BINS: Final = 10  # of a reliability table, equally wide
-KEPT: Final = 0.8  # coverage at which the error of the surest pixels is told
+KEPT: Final = 0.8  # coverage at which the error of the surest pixels is reported
 GROUPS: Final = ("all", "place", "season")
 _CHANCES: Final = np.arange(SILENT) / CERTAIN
 _BIN: Final = np.minimum((_CHANCES * BINS).astype(int), BINS - 1)
@@ -213,8 +215,8 @@ def recall(counts: Floats) -> Floats:
     return _ratio(_seen(counts)[..., 1], counts[..., 1, :].sum(axis=-1))
 
 
-def recall_said(counts: Floats) -> Floats:
-    """Return the fraction of what is there that is seen, of pixels of which something is said."""
+def recall_where_known(counts: Floats) -> Floats:
+    """Return the fraction of what is there that is seen, of pixels with a prediction."""
     return _ratio(_seen(counts)[..., 1], counts[..., 1, :SILENT].sum(axis=-1))
 
 
@@ -225,7 +227,7 @@ def precision(counts: Floats) -> Floats:
 
 
 def silent_share(counts: Floats) -> Floats:
-    """Return the fraction of labelled pixels of which nothing is said."""
+    """Return the fraction of labelled pixels without a prediction."""
     return _ratio(counts[..., SILENT].sum(axis=-1), counts.sum(axis=(-2, -1)))
 
 
@@ -243,7 +245,7 @@ def auc(counts: Floats) -> Floats:
 
 
 def brier(counts: Floats) -> Floats:
-    """Return the mean squared difference of probability and truth, where something is said."""
+    """Return the mean squared difference of probability and truth, where there is a prediction."""
     absent, present = counts[..., 0, :SILENT], counts[..., 1, :SILENT]
     total = absent @ _CHANCES**2 + present @ (1 - _CHANCES) ** 2
     return _ratio(total, (absent + present).sum(axis=-1))
@@ -273,31 +275,31 @@ def _binned(counts: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def share_gap(counts: Floats) -> Floats:
-    """Return the mean probability less the fraction present, where something is said."""
+    """Return the mean probability less the fraction present, where there is a prediction."""
     both = counts[..., :SILENT].sum(axis=-2)
     return _ratio(both @ _CHANCES - counts[..., 1, :SILENT].sum(axis=-1), both.sum(axis=-1))
 
 
-def error_said(counts: Floats) -> Floats:
-    """Return the fraction of pixels that are taken for the wrong state, where something is said."""
-    wrong, said = _by_level(counts)
-    return _ratio(wrong.sum(axis=-1), said.sum(axis=-1))
+def error_where_known(counts: Floats) -> Floats:
+    """Return the fraction of pixels that are taken for the wrong state, where there is a prediction."""
+    wrong, answered = _by_level(counts)
+    return _ratio(wrong.sum(axis=-1), answered.sum(axis=-1))
 
 
-def error_kept(counts: Floats) -> Floats:
-    """Return the error of the surest 80 % of the labelled pixels; NaN where less is said.
+def error_of_most_confident(counts: Floats) -> Floats:
+    """Return the error of the surest 80 % of the labelled pixels; NaN where fewer have a prediction.
 
     This is what is left to go wrong once the rest becomes unknown. Pixels that are equally sure are kept together.
     """
-    wrong, said = (np.cumsum(part, axis=-1) for part in _by_level(counts))
-    enough = said >= KEPT * counts.sum(axis=(-2, -1))[..., None]
+    wrong, answered = (np.cumsum(part, axis=-1) for part in _by_level(counts))
+    enough = answered >= KEPT * counts.sum(axis=(-2, -1))[..., None]
     first = np.argmax(enough, axis=-1)[..., None]
-    kept = _ratio(np.take_along_axis(wrong, first, -1)[..., 0], np.take_along_axis(said, first, -1)[..., 0])
+    kept = _ratio(np.take_along_axis(wrong, first, -1)[..., 0], np.take_along_axis(answered, first, -1)[..., 0])
     return np.where(enough.any(axis=-1), kept, np.nan)
 
 
 def aurc(counts: Floats) -> Floats:
-    """Return the area under error over coverage, where something is said: pixels become unknown, least sure first.
+    """Return the area under error over coverage, where there is a prediction: pixels become unknown, least sure first.
 
     Geifman et al., ICLR 2019. Pixels that are equally sure are kept together.
 
@@ -306,13 +308,13 @@ def aurc(counts: Floats) -> Floats:
     >>> aurc(counts).item()
     0.25
     """
-    wrong, said = _by_level(counts)
-    error = np.nan_to_num(_ratio(np.cumsum(wrong, axis=-1), np.cumsum(said, axis=-1)))
-    return _ratio((said * error).sum(axis=-1), said.sum(axis=-1))
+    wrong, answered = _by_level(counts)
+    error = np.nan_to_num(_ratio(np.cumsum(wrong, axis=-1), np.cumsum(answered, axis=-1)))
+    return _ratio((answered * error).sum(axis=-1), answered.sum(axis=-1))
 
 
 def _by_level(counts: Floats) -> tuple[Floats, Floats]:
-    """Return wrong pixels and all of which something is said, by how sure they are, surest first, shape (..., 128)."""
+    """Return wrong pixels and all with a prediction, by how sure they are, surest first, shape (..., 128)."""
     wrong = np.concatenate((counts[..., 1, :SEEN], counts[..., 0, SEEN:SILENT]), axis=-1)
     return wrong @ _IN_LEVEL, counts[..., :SILENT].sum(axis=-2) @ _IN_LEVEL
 
@@ -325,10 +327,19 @@ PIXEL_METRICS: Final = (
     PixelMetric(name="brier", meaning="mean squared error of the probability", better="lower", compute=brier),
     PixelMetric(name="ece", meaning="expected calibration error, ten bins", better="lower", compute=calibration_error),
     PixelMetric(name="share_gap", meaning="mean probability less fraction present", better="", compute=share_gap),
-    PixelMetric(name="silent", meaning="fraction of pixels of which nothing is said", better="", compute=silent_share),
-    PixelMetric(name="recall_said", meaning="recall where something is said", better="higher", compute=recall_said),
-    PixelMetric(name="error", meaning="wrong pixels where something is said", better="lower", compute=error_said),
-    PixelMetric(name="error_80", meaning="wrong pixels of the surest 80 %", better="lower", compute=error_kept),
+    PixelMetric(name="silent", meaning="fraction of pixels without a prediction", better="", compute=silent_share),
+    PixelMetric(
+        name="recall_where_known",
+        meaning="recall where there is a prediction",
+        better="higher",
+        compute=recall_where_known,
+    ),
+    PixelMetric(
+        name="error", meaning="wrong pixels where there is a prediction", better="lower", compute=error_where_known
+    ),
+    PixelMetric(
+        name="error_80", meaning="wrong pixels of the surest 80 %", better="lower", compute=error_of_most_confident
+    ),
     PixelMetric(name="aurc", meaning="area under error over coverage", better="lower", compute=aurc),
 )
 
@@ -354,7 +365,7 @@ def segmentation_scores(
     DataFrame
         `group` is "all", "place" or "season", `name` which one; then class, metric, value; `lo`, `hi` of draws of
         places, then of images within them, NaN for a single place; `lo_images`, `hi_images` of draws of images alone,
-        NaN for a single one; the number of images and of places; and labelled pixels. A class of which nothing is said
+        NaN for a single one; the number of images and of places; and labelled pixels. A class without a prediction
         in any image, since the segmenter cannot tell it, has no row.
     """
     rows = [row for group, name, part in _groups(counts, groups) for row in _rows(group, name, part, draws)]
@@ -366,7 +377,7 @@ def segmentation_scores(
 
 
 def _groups(counts: Sequence[PixelCounts], groups: Sequence[str]) -> Iterator[tuple[str, str, list[PixelCounts]]]:
-    """Yield the images of all, of each place and of each season that is told, as far as they are wanted."""
+    """Yield the images of all, of each place and of each season that is known, as far as they are wanted."""
     if GROUPS[0] in groups:
         yield GROUPS[0], "", list(counts)
     for group in filter(groups.__contains__, GROUPS[1:]):
@@ -374,8 +385,8 @@ def _groups(counts: Sequence[PixelCounts], groups: Sequence[str]) -> Iterator[tu
             yield group, name, [one for one in counts if getattr(one, group) == name]
 
 
-def told_classes(counts: Sequence[PixelCounts]) -> tuple[str, ...]:
-    """Return the classes of which something is said on a labelled pixel of any image, as they first come."""
+def predicted_classes(counts: Sequence[PixelCounts]) -> tuple[str, ...]:
+    """Return the classes with a prediction on a labelled pixel of any image, as they first come."""
     names = dict.fromkeys(name for one in counts for name in one.classes)
     return tuple(name for name in names if any(one.of_class(name)[:, :SILENT].any() for one in counts))
 
@@ -383,19 +394,19 @@ def told_classes(counts: Sequence[PixelCounts]) -> tuple[str, ...]:
 def _rows(group: str, name: str, counts: list[PixelCounts], draws: int) -> Iterator[tuple[str | float, ...]]:
     """Yield rows with the columns of `segmentation_scores`."""
     places = [one.place for one in counts]
-    for told in told_classes(counts):
-        table = np.stack([one.of_class(told) for one in counts]).astype(np.float64)
+    for class_name in predicted_classes(counts):
+        table = np.stack([one.of_class(class_name) for one in counts]).astype(np.float64)
         used = table.sum(axis=(1, 2)) > 0
         where = [place for place, is_used in zip(places, used, strict=True) if is_used]
         tail = len(where), len(set(where)), int(table.sum())
-        seed = seed_of_text(f"{group}/{name}/{told}")
+        seed = seed_of_text(f"{group}/{name}/{class_name}")
         by_image = _drawn(table[used], ["all"] * len(where), seed, draws)
         has_others = len(set(where)) > 1  # one place says nothing of others
         by_place = _drawn(table[used], where, seed, draws) if has_others else np.full_like(by_image, np.nan)
         for metric, first, second in zip(PIXEL_METRICS, by_place, by_image, strict=True):
             value = float(metric.compute(table.sum(axis=0)))
             outer, inner = percentile_interval(value, first), percentile_interval(value, second)
-            yield group, name, told, metric.name, value, outer.lo, outer.hi, inner.lo, inner.hi, *tail
+            yield group, name, class_name, metric.name, value, outer.lo, outer.hi, inner.lo, inner.hi, *tail
 
 
 def _drawn(table: Floats, blocks: list[str], seed: int, draws: int) -> Floats:
@@ -413,7 +424,7 @@ def reliability(counts: Sequence[PixelCounts], **about: str) -> pd.DataFrame:
     Chances can be trusted where the last two agree; bins without pixels are left out.
     """
     rows = []
-    for name in told_classes(counts):
+    for name in predicted_classes(counts):
         pixels, mass, hits = _binned(_total(counts, name))
         for at in np.flatnonzero(pixels).tolist():
             row = {"class": name, "from": at / BINS, "to": (at + 1) / BINS, "pixels": int(pixels[at])}
@@ -427,13 +438,15 @@ def error_over_coverage(counts: Sequence[PixelCounts], **about: str) -> pd.DataF
     Columns: confidence (max of P and 1 - P), coverage of all labelled pixels, error, and recall, which falls with it.
     """
     rows = []
-    for name in told_classes(counts):
+    for name in predicted_classes(counts):
         total = _total(counts, name)
-        wrong, said = (np.cumsum(part) for part in _by_level(total))
+        wrong, answered = (np.cumsum(part) for part in _by_level(total))
         found = np.cumsum(np.concatenate((np.zeros(SEEN), total[1, SEEN:SILENT])) @ _IN_LEVEL)
-        for at in np.flatnonzero(np.diff(said, prepend=0.0)).tolist():
-            row = {"class": name, "confidence": 0.5 + (SEEN - at) / CERTAIN, "coverage": said[at] / total.sum()}
-            rows.append({**about, **row, "error": wrong[at] / said[at], "recall": found[at] / max(total[1].sum(), 1)})
+        for at in np.flatnonzero(np.diff(answered, prepend=0.0)).tolist():
+            row = {"class": name, "confidence": 0.5 + (SEEN - at) / CERTAIN, "coverage": answered[at] / total.sum()}
+            rows.append(
+                {**about, **row, "error": wrong[at] / answered[at], "recall": found[at] / max(total[1].sum(), 1)}
+            )
     return pd.DataFrame(rows)
 
 

@@ -156,7 +156,7 @@ def _learned(trial: SegmenterTrial) -> str:
 SHOWN: Final = ("building", "road_minor", "water", "green")  # classes of the tables by season and place
 MAIN: Final = "building"  # the one class that all real pictures have labels of
 QUALITY: Final = ("iou", "recall", "precision", "auc", "ece")
-SILENCE: Final = ("silent", "recall", "recall_said", "error", "error_80", "aurc")
+SILENCE: Final = ("silent", "recall", "recall_where_known", "error", "error_80", "aurc")
 KEPT: Final = (0.95, 0.9, 0.8, 0.6)  # coverages
 NARROW: Final = "†"  # an interval that draws pictures alone
 NONE: Final = "-"
@@ -170,7 +170,7 @@ _TITLES: Final = {
     "auc": "AUC",
     "ece": "ECE",
     "aurc": "AURC",
-    "recall_said": "recall, said",
+    "recall_where_known": "recall, answered",
     "error_80": "error, surest 80 %",
 }
 
@@ -291,7 +291,7 @@ def _counted(rows: pd.DataFrame) -> dict[str, str]:
 
 
 def _present(board: SegmenterBoard) -> dict[tuple[str, ...], float]:
-    """Return the fraction of the labelled pixels that a class covers, by trial and class, where something is said."""
+    """Return the fraction of the labelled pixels that a class covers, by trial and class, where predicted."""
     table = board.reliability
     hits = (table["pixels"] * table["present"]).groupby([table[name] for name in (*TRIAL, "class")]).sum()
     pixels = table.groupby([*TRIAL, "class"])["pixels"].sum()

@@ -243,7 +243,7 @@ def validate(path: Path, tasks: Sequence[Task]) -> Iterator[Violation]:
     """Yield the violations of predictions in the order of the rows, queries without a row last.
 
     `path` is a predictions file, or a run's folder of parts, where a newer row replaces an older one. It should answer
-    the tasks and no others. Rows of a run's folder that state other queries are skipped (`set_aside` counts them).
+    the tasks and no others. Rows of a run's folder that state other queries are skipped (`count_excluded` counts them).
     Raise StoreError if a file cannot be read at all, or the folder holds runs of two matchers.
     """
     prediction_files.check_one_matcher([path])
@@ -268,8 +268,8 @@ def validate(path: Path, tasks: Sequence[Task]) -> Iterator[Violation]:
         wrong = {} if differing else _faults_by_row(file.name, table)
         for row, item in enumerate([] if differing else prediction_files.items_of(table)):
             tie = prediction_files.tie_of(item)
-            is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(under[file.parent])
-            if item["query_id"] not in before and not is_aside:
+            is_excluded = path.is_dir() and bool(tie.asked) and not tie.answers(under[file.parent])
+            if item["query_id"] not in before and not is_excluded:
                 yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
     yield from _missing(path.name, [] if unread else queries, seen)
 
@@ -368,7 +368,7 @@ def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iter
             yield Violation(file, -1, "query_id", f"{NO_ROW}{name}", "one for every query")
 
 
-def set_aside(path: Path, tasks: Sequence[Task]) -> int:
+def count_excluded(path: Path, tasks: Sequence[Task]) -> int:
     """Return how many answers of a run's folder are to queries that the tasks do not hold in this form.
 
     Raise StoreError if a file cannot be read.

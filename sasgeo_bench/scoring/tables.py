@@ -381,7 +381,7 @@ AS_USED: Final[Mapping[str, Use]] = {
     "flight-clean": Use(words="a flight and a map of the day"),
     "flight-real-age": Use(words="a flight and a map 2 to 10 years old"),
 }
-_RETRIEVAL: Final = "retrieval"  # nobody hands a user candidates of which one is right
+_RETRIEVAL: Final = "retrieval"  # a user has no candidates of which one is right
 
 
 def scene_frame(scores: Mapping[str, pd.DataFrame], *, draws: int, excluded: Collection[str] = ()) -> pd.DataFrame:

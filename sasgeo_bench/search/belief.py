@@ -122,14 +122,14 @@ class GridBelief:
             return replace(self, mass=np.full_like(self.mass, 1.0 / self.mass.size))
         return replace(self, mass=self.mass / np.float32(total))
 
-    def weighed(self, logs: Floats, *, doubt: float) -> Self:
+    def weighed(self, logs: Floats, *, outlier_probability: float) -> Self:
         """Multiply by a likelihood of which `logs` are the logarithms at the headings in `asked`, up to a constant.
 
-        With probability `doubt` a view says nothing, whatever it shows: it never makes a place less likely than that
+        With `outlier_probability` a view says nothing, whatever it shows: it never makes a place less likely than that
         share of the likeliest one. So one view, however sure, excludes nothing.
         """
-        found = np.float32(doubt) * self.mass
-        found[self.asked] += self.mass[self.asked] * np.exp(logs - logs.max()) * np.float32(1 - doubt)
+        found = np.float32(outlier_probability) * self.mass
+        found[self.asked] += self.mass[self.asked] * np.exp(logs - logs.max()) * np.float32(1 - outlier_probability)
         return replace(self, mass=found).normalised()
 
     def fitted(self) -> Self:
@@ -385,7 +385,9 @@ def _boxed(layer: Floats, variance: float) -> Floats:
 SCORED_M: Final = 16.0  # largest cell that a view is scored on
 
 
-def surface_logs(field: Field, template: Template, belief: GridBelief, *, temper: float, scale: float = 1.0) -> Floats:
+def surface_logs(
+    field: Field, template: Template, belief: GridBelief, *, exponent_scale: float, scale: float = 1.0
+) -> Floats:
     """Return tempered scores of a view at the headings in `belief.asked` and each cell, shape (A, rows, cols).
 
     The map is scored in cells of the belief, on which thin classes are spread, but for cells larger than `SCORED_M`:
@@ -403,7 +405,7 @@ def surface_logs(field: Field, template: Template, belief: GridBelief, *, temper
         scores = _scores(
             field, template, belief, belief.yaws_deg[belief.asked[chosen]], factor=belief.factor // parts, scale=scale
         )
-        found[chosen] = pooled_logs(np.float32(temper) * scores, parts)
+        found[chosen] = pooled_logs(np.float32(exponent_scale) * scores, parts)
     return found
 
 

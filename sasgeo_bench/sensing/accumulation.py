@@ -131,8 +131,8 @@ def accumulate(
     equally correlated measurements. Uncertainty of place is no weight but an interval: a frame that may be off by r
     says "present" only where all cells within r are, and "absent" only where none is; elsewhere it says nothing. So
     unknown grows around every border with the distance since a frame, and thin things are forgotten first. r is
-    `caution` times `Errors.apart_m` at a mean distance from the middle of the view. More caution makes what is said
-    truer, and less is said: choose it on training places.
+    `caution` times `Errors.apart_m` at a mean distance from the middle of the view. More caution makes the states
+    that are kept truer, and keeps fewer: choose it on training places.
 
     Examples
     --------

@@ -202,7 +202,7 @@ class LabelledImage:
     classes : tuple of str
         Names of the classes, in the order of `labels`; classes overlap, as a bridge and the river below it do.
     labels : ndarray of uint8, shape (C, H, W)
-        ABSENT 0, PRESENT 1 or UNKNOWN 2, where nobody has looked; made read-only.
+        ABSENT 0, PRESENT 1 or UNKNOWN 2, where nothing is labelled; made read-only.
     place : str
         Region or town; parts of an image set are never split within one.
 
@@ -392,7 +392,7 @@ def write_labelled(folder: Path, images: Iterable[LabelledImage]) -> tuple[Path,
         if labelled.classes != classes:
             raise ImageError(
                 f"image {number} labels {', '.join(labelled.classes)}, the first one {', '.join(classes)}: "
-                "label the same classes everywhere, as unknown where nobody has looked"
+                "label the same classes everywhere, as unknown where nothing is labelled"
             )
         paths.append(folder / f"{number:06d}{SUFFIX}")
         with fresh_file(paths[-1], mend="free some space and run again") as scratch:

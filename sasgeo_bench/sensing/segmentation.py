@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segmentation: the probability of every class at every pixel of an image, or that nothing is said there."""
+"""Segmentation: the probability of every class at every pixel of an image, or no prediction."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from scipy.special import expit, logit
 from sasgeo_bench.core.errors import ImageError
 from sasgeo_bench.sensing.image import check_classes, pack_parts, split_parts, unpack_body
 
-SILENT: Final = 255  # the byte of a pixel of which nothing is said
+SILENT: Final = 255  # the byte of a pixel without a prediction
 CERTAIN: Final = 254  # the byte of P(present) = 1
 MOST_CLASSES: Final = 64
 MOST_VALUES: Final = 2**30  # bytes of probabilities in one segmentation
@@ -82,13 +82,13 @@ class Segmentation:
         return (self.probability_bytes.shape[1], self.probability_bytes.shape[2])
 
     def probabilities(self) -> NDArray[np.float32]:
-        """Return P(present) for each class and pixel, shape (C, H, W); NaN where nothing is said."""
+        """Return P(present) for each class and pixel, shape (C, H, W); NaN where there is no prediction."""
         table = (np.arange(SILENT + 1) * _STEP).astype(np.float32)
         table[SILENT] = np.nan
         return table[self.probability_bytes]
 
     def shares(self) -> dict[str, float]:
-        """Return the mean probability of each class over the pixels of which something is said; NaN where none is.
+        """Return the mean probability of each class over the pixels with a prediction; NaN where none is.
 
         >>> seen = Segmentation(classes=("water",), probability_bytes=np.array([[[0, 254, 255]]], dtype=np.uint8))
         >>> seen.shares()
@@ -112,7 +112,7 @@ class Segmentation:
         -------
         Segmentation
             Log-odds of each named class are shifted by one number, so the order of pixels stays; pixels of which
-            nothing is said stay so. The mean is met up to the rounding of bytes (1/508).
+            there is no prediction stay so. The mean is met up to the rounding of bytes (1/508).
 
         Raises
         ------
@@ -138,7 +138,7 @@ class Segmentation:
         return self.recoded(tables_of(self.counts(), shares))
 
     def counts(self) -> dict[str, NDArray[np.int64]]:
-        """Return how many pixels have each byte, shape (255,), by class; those of which nothing is said are left out.
+        """Return how many pixels have each byte, shape (255,), by class; those without a prediction are left out.
 
         Counts of several pictures add up: with the sum `tables_of` recalibrates them together, as one flight.
         """

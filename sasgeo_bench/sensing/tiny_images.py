@@ -55,7 +55,7 @@ def _picture(place: str, rng: np.random.Generator) -> LabelledImage:
         rgb[labels[CLASSES.index(name)] == 1] = rng.normal(_COLOURS[name], 8)  # spread of a colour between pictures
     # 8: noise of a pixel, in steps of 255
     noisy = np.clip(rgb + rng.normal(scale=8.0, size=rgb.shape), 0, 255).astype(np.uint8)
-    labels[:, :, -6:] = UNKNOWN  # pixels: margin at the right edge, where nobody has looked
+    labels[:, :, -6:] = UNKNOWN  # pixels: margin at the right edge, which is not labelled
     return LabelledImage(image=with_picture(noisy), classes=CLASSES, labels=labels, place=place)
 
 

@@ -363,17 +363,17 @@ def check_task(task: Task) -> list[str]:
     """Check a task against its hashes, its truths and its map; return a line for each fault."""
     faults = task.faults()
     if not task.manifest.is_of_map(region_files.read_manifest(task.region)):
-        faults.append(built_anew(task.manifest.region))
+        faults.append(rebuild_hint(task.manifest.region))
     return faults
 
 
-def built_anew(region: str) -> str:
+def rebuild_hint(region: str) -> str:
     """Return the message that a map is no longer the one its queries were drawn on."""
     return f"{region} was built anew since: make the queries again"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawn:
+class TaskResult:
     """Result of a request: its folders, or what the region lacks for it, and the lines of progress."""
 
     lines: tuple[str, ...]
@@ -381,7 +381,7 @@ class Drawn:
     lack: str | None = None
 
 
-def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
+def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[TaskResult]:
     """Draw the tasks of requests with several processes, whose number changes no query; yield results in order.
 
     Tasks that are up to date stay. Raise a StoreError if a folder cannot be written or
@@ -390,11 +390,11 @@ def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
     yield from spread(_carry_out, requests, jobs=jobs, label="tasks drawn")
 
 
-def _carry_out(request: Request) -> Drawn:
+def _carry_out(request: Request) -> TaskResult:
     lines: list[str] = []
     try:
         with reporting(lines.append):
             folders = ensure_tasks(request)
     except ConfigError as error:
-        return Drawn(lines=tuple(lines), lack=str(error).removesuffix(_SKIP))
-    return Drawn(lines=tuple(lines), folders=folders)
+        return TaskResult(lines=tuple(lines), lack=str(error).removesuffix(_SKIP))
+    return TaskResult(lines=tuple(lines), folders=folders)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map with the faults of mapping from other pictures: roofs that nobody drew, and outlines a little off."""
+"""A map with the faults of mapping from other pictures: roofs that are missing, and outlines a little off."""
 
 from typing import TYPE_CHECKING, Final
 

@@ -33,7 +33,17 @@ from sasgeo_bench.tasks.query import (
 from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, Job, drawn_share, make_prior
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Draft, Scene, Seeds, Shot, Site, Variant, changed_share
+from sasgeo_bench.tasks.suites.base import (
+    EVERYTHING,
+    Choice,
+    QueryDraft,
+    Scene,
+    Seeds,
+    Site,
+    Variant,
+    ViewRequest,
+    changed_share,
+)
 from sasgeo_bench.tasks.suites.flights import (
     EXTENT,
     HEIGHT_M,
@@ -324,19 +334,19 @@ class FlightDrawer:
         unseen, time_s = _unseen(flight, mission), views.time_s - views.time_s[0]
         for frame in range(len(views)):
             is_lost = mission.is_lost and frame == flight.middle
-            told = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
+            step = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
             flown = {"distance_m": round(float(distance_m[frame]), 1), "time_s": round(float(time_s[frame]), 2)}
             own = flown | {"is_seen": float(not unseen[frame])}
-            yield self._view(job, mission, pose_of(views, frame, flight.scale), told, own | measured)
+            yield self._view(job, mission, pose_of(views, frame, flight.scale), step, own | measured)
 
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:
         """Return what the odometer says: to the middle and from there on what it says in the control."""
         seeds, profile, into = self._seeds(flight.site), load_profile(mission.profile), flight.middle - 1
-        told, control = (
+        step, control = (
             draw_odometry(flown, profile, belief=mission.belief, rng=seeds.rng("odometry", mission.draw))
             for flown in (views, flight.views)
         )
-        both = {item.name: (getattr(told, item.name), getattr(control, item.name)) for item in fields(Odometry)}
+        both = {item.name: (getattr(step, item.name), getattr(control, item.name)) for item in fields(Odometry)}
         return Odometry(**{name: np.concatenate([own[:into], usual[into:]]) for name, (own, usual) in both.items()})
 
     def _seeds(self, site: Site) -> Seeds:
@@ -355,7 +365,7 @@ class FlightDrawer:
         seeds = self._seeds(job.site)
         of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
         site = replace(job.site, pose=pose, density=drawn_share(scene.map, pose, variant))
-        draft = self.suite.draw(Shot(scene=scene, site=site, variant=variant, seeds=of_view, flight_seeds=seeds))
+        draft = self.suite.draw(ViewRequest(scene=scene, site=site, variant=variant, seeds=of_view, flight_seeds=seeds))
         evidence = draft.evidence
         if not measured["is_seen"]:
             evidence = evidence.replace(np.full_like(evidence.cells, UNKNOWN))
@@ -384,7 +394,7 @@ class FlightDrawer:
         )
         return query, self._truth(job, query, site, replace(draft, measured=draft.measured | measured))
 
-    def _truth(self, job: Job, query: Query, site: Site, draft: Draft) -> Truth:
+    def _truth(self, job: Job, query: Query, site: Site, draft: QueryDraft) -> Truth:
         variant, state = job.variant, self.scene.state(query.region)
         changed = draft.changed_share
         if changed is None:

@@ -18,13 +18,13 @@ from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
 from sasgeo_bench.tasks.suites.base import (
     EVERYTHING,
     Choice,
-    Draft,
+    QueryDraft,
     Scene,
     Seeds,
-    Shot,
     Site,
     Suite,
     Variant,
+    ViewRequest,
     changed_share,
 )
 from sasgeo_bench.tasks.suites.mining import (
@@ -129,7 +129,7 @@ class Drawer:
     def draw(self, job: Job) -> tuple[Query, Truth]:
         """Draw one query and its truth."""
         site, seeds = job.site, self._site_seeds(job.site)
-        draft = self.suite.draw(Shot(scene=self.scene, site=site, variant=job.variant, seeds=seeds))
+        draft = self.suite.draw(ViewRequest(scene=self.scene, site=site, variant=job.variant, seeds=seeds))
         group = draft.group or self.group
         if job.track == "retrieval":  # a disc around the truth would show which of the candidates is right
             group = replace(group, radius_m=None)
@@ -178,7 +178,7 @@ class Drawer:
 
         return share
 
-    def _truth(self, job: Job, draft: Draft, state: State, decoys: Decoys, right: int) -> Truth:
+    def _truth(self, job: Job, draft: QueryDraft, state: State, decoys: Decoys, right: int) -> Truth:
         site, variant = job.site, job.variant
         changed, world = draft.changed_share, self.scene.world
         if changed is None:
@@ -207,12 +207,12 @@ class Drawer:
             labels=draft.labels,
         )
 
-    def _twins_m(self, site: Site, draft: Draft) -> tuple[tuple[float, float], ...]:
+    def _twins_m(self, site: Site, draft: QueryDraft) -> tuple[tuple[float, float], ...]:
         """Return the twins of a site (easting, northing) if a draft shows the site and has twins."""
         is_of_site = draft.has_twins and draft.has_pose and draft.pose is None
         return self.scene.twins.get(site.index, ()) if is_of_site else ()
 
-    def _twin(self, site: Site, draft: Draft) -> dict[str, float]:
+    def _twin(self, site: Site, draft: QueryDraft) -> dict[str, float]:
         """Return the offset east and north of the site's first twin, if there is one, for contact sheets."""
         twins = self._twins_m(site, draft)
         if not twins:
@@ -241,7 +241,7 @@ class Drawer:
             points = points[np.hypot(*(points - twin).T) >= min_distance_m(job.variant.side_m / 2)]
         return points
 
-    def _candidates(self, job: Job, draft: Draft, state: State, prior: Prior) -> tuple[tuple[Pose, ...], int]:
+    def _candidates(self, job: Job, draft: QueryDraft, state: State, prior: Prior) -> tuple[tuple[Pose, ...], int]:
         """Shuffle the true place, its twins and the best decoys for each query, all jittered alike."""
         site, points = job.site, self._decoys(state, job)
         # The number of candidates must not show whether the truth or twins are among them.

@@ -36,7 +36,7 @@ class Segmented:
     """What a segmenter says of a picture, reduced to one class a pixel.
 
     `drawn`, uint8 of shape (H, W), is 1 plus the position in `PAINT_ORDER` of the last class there with
-    P(present) >= 0.5, `NOTHING` without one, and `SILENT` where nothing is said of any class.
+    P(present) >= 0.5, `NOTHING` without one, and `SILENT` where no class has a prediction.
 
     >>> seen = Segmentation(classes=("green", "building"), probability_bytes=np.array([[[200, 200]], [[0, 200]]], "u1"))
     >>> [PAINT_ORDER[at - 1] for at in Segmented.of(seen).drawn[0]]

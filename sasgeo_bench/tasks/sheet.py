@@ -30,7 +30,7 @@ from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import GROUND, PAINT_ORDER, paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
-from sasgeo_bench.tasks.build import built_anew
+from sasgeo_bench.tasks.build import rebuild_hint
 from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, PriorGroup, Query, Truth, flight_id
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import changed_share
@@ -44,7 +44,7 @@ ONLY_MAPPED: Final = "#1565c0"
 AGREE: Final = "#d9d9d9"
 TWIN: Final = "map at the twin"
 DECOY: Final = "map at the hardest decoy"
-_OF_TWIN: Final = (TWIN_EAST, TWIN_NORTH, RIVALS, IN_DISC, LISTED, TRUTH_LISTED, LEAD)  # told in words
+_OF_TWIN: Final = (TWIN_EAST, TWIN_NORTH, RIVALS, IN_DISC, LISTED, TRUTH_LISTED, LEAD)  # shown in words
 _COLUMNS: Final = ("view", "map at the true place", "view against map")
 _CELL_INCHES: Final = 2.4
 _TEXT_INCHES: Final = 3.0  # width of the text column, readable when the sheet is shown smaller
@@ -199,17 +199,17 @@ def rival_text(truth: Truth) -> str:
     Examples
     --------
     >>> from types import SimpleNamespace
-    >>> told = {"twin_east_m": 300.0, "twin_north_m": -400.0, "rivals": 1, "rivals_listed": 1, "truth_listed": 0}
-    >>> rival_text(SimpleNamespace(measured=told))
+    >>> measured = {"twin_east_m": 300.0, "twin_north_m": -400.0, "rivals": 1, "rivals_listed": 1, "truth_listed": 0}
+    >>> rival_text(SimpleNamespace(measured=measured))
     'twin 500 m away; a plain search lists the twin alone'
     """
-    told = truth.measured
-    if TWIN_EAST not in told:
+    measured = truth.measured
+    if TWIN_EAST not in measured:
         return ""
-    away = f"twin {math.hypot(told[TWIN_EAST], told[TWIN_NORTH]):.0f} m away"
-    if RIVALS not in told:
+    away = f"twin {math.hypot(measured[TWIN_EAST], measured[TWIN_NORTH]):.0f} m away"
+    if RIVALS not in measured:
         return away
-    is_rival, is_truth = told[LISTED] == told[RIVALS], told[TRUTH_LISTED] == 1
+    is_rival, is_truth = measured[LISTED] == measured[RIVALS], measured[TRUTH_LISTED] == 1
     both = {(True, True): "both", (True, False): "the twin alone", (False, True): "the place alone"}
     return f"{away}; a plain search lists {both.get((is_rival, is_truth), 'neither')}"
 
@@ -266,7 +266,7 @@ def panels_of(
     name = task.manifest.region
     region = region_files.read_region(task.region)
     if not task.manifest.is_of_map(region.manifest):
-        raise StoreError(built_anew(name))
+        raise StoreError(rebuild_hint(name))
     state = State.of(region, name=name)
     truths = {truth.query_id: truth for truth in task.truths}
     strangers = StoreError(f"{task.truth} does not hold the truths of {task.folder}: make the queries again")
@@ -500,7 +500,7 @@ def write_flight_sheet(path: Path, task: Task, shown: Sequence[FlightPanel]) -> 
     """
     about, manifest = task.manifest, region_files.read_manifest(task.region)
     if not about.is_of_map(manifest):
-        raise StoreError(built_anew(about.region))
+        raise StoreError(rebuild_hint(about.region))
     places = list(_places(shown))
     row_is_site = len({panel.truth.pair_id for panel in shown}) < len(shown)
     across = 1 + max((column for _, column in places), default=0)

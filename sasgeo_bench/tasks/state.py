@@ -19,7 +19,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.layers import read_bits
-from sasgeo_bench.regions.region import Late, MapGraph, Region
+from sasgeo_bench.regions.region import Lazy, MapGraph, Region
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -39,8 +39,8 @@ class State:
     grid: Grid
     classes: tuple[str, ...]
     bits: LayerBits
-    features: Late["gpd.GeoDataFrame"] = Late()  # noqa: RUF009 - no default: a field that may be a function
-    graph: Late[MapGraph] = Late()  # noqa: RUF009
+    features: Lazy["gpd.GeoDataFrame"] = Lazy()  # noqa: RUF009 - no default: a field that may be a function
+    graph: Lazy[MapGraph] = Lazy()  # noqa: RUF009
     coverage: shapely.Geometry
 
     @classmethod

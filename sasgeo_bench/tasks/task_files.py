@@ -294,12 +294,12 @@ def truth_sha256(truth: Truth) -> str:
     return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
-def tie_key(learned: str | None, *others: str | None) -> str | None:
+def dependency_key(learned: str | None, *others: str | None) -> str | None:
     """Return the key of what decides an answer besides the question: what was learned, and hashes of other things.
 
     Others are rendered imagery that was looked at, and how flights are followed.
 
-    >>> tie_key("ab", None), len(tie_key(None, "cd"))
+    >>> dependency_key("ab", None), len(dependency_key(None, "cd"))
     ('ab', 64)
     """
     key = learned
@@ -308,12 +308,12 @@ def tie_key(learned: str | None, *others: str | None) -> str | None:
     return key
 
 
-def asked_under(asked: str, key: str | None) -> str:
-    """Return the hash that an answer carries: that of the question and of what else decides it (`tie_key`).
+def answer_hash(asked: str, key: str | None) -> str:
+    """Return the hash that an answer carries: that of the question and of what else decides it (`dependency_key`).
 
     Examples
     --------
-    >>> asked_under("ab", None), len(asked_under("ab", "cd"))
+    >>> answer_hash("ab", None), len(answer_hash("ab", "cd"))
     ('ab', 64)
     """
     return asked if key is None else hashlib.sha256(f"{asked} {key}".encode()).hexdigest()

@@ -78,7 +78,7 @@ class Request(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted(Settings):
+class TaskRequest(Settings):
     """Suites, a split, and regions as ids or files; without regions, all of the split that can be built.
 
     `sealed_seed` draws the sealed places of the split; without it they are left out.
@@ -91,7 +91,7 @@ class Wanted(Settings):
     sealed_seed: PrivateSeed | None = None
 
 
-def plan_requests(wanted: Wanted) -> tuple[Request, ...]:
+def plan_requests(wanted: TaskRequest) -> tuple[Request, ...]:
     """Plan one request for each region and suite; read nothing but settings.
 
     Raises
@@ -148,7 +148,7 @@ def _other_split(region: str) -> str:
     return "add it to a split file of your own" + (f", or use --split {found}" if found else "")
 
 
-def _without_sealed(named: Mapping[str, RegionFile], split: Split, wanted: Wanted) -> tuple[RegionFile, ...]:
+def _without_sealed(named: Mapping[str, RegionFile], split: Split, wanted: TaskRequest) -> tuple[RegionFile, ...]:
     """Leave out regions of sealed places unless their seed is given, and tell so in one line."""
     closed = [] if wanted.sealed_seed is not None else [name for name in named if split.sealed_place(name)]
     if not closed:
@@ -205,7 +205,7 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
     Its map knows of all classes that the region's knows of; beside a region that knows of few, a town will do where no
     real place does.
     It depends on the split alone, so that asking for more regions changes no query. In a hold-out it is of the same
-    part, so that nobody learns from views of a test place; and of another country, whose places calibrate others. No
+    part, so that none learns from views of a test place; and of another country, whose places calibrate others. No
     view is of a sealed place.
     """
     places = split.spec.place

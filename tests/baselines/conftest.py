@@ -12,7 +12,7 @@ import pytest
 from sasgeo_baselines.segmenters.network import drawn_weights, encoder_shapes
 
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.made_up import CLASSES, query_of, region_of, textured, view_of
 
 
@@ -26,7 +26,7 @@ def made() -> SimpleNamespace:
 def town_tasks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root with a quarter of town-grid, which is enough for the search of a view, and the suite `clean` at one site."""
     out = tmp_path_factory.mktemp("baselines") / "out"
-    wanted = Wanted(suites=("clean",), regions=("town-grid",), split="crossfit", count=1, seed=0, out=out)
+    wanted = TaskRequest(suites=("clean",), regions=("town-grid",), split="crossfit", count=1, seed=0, out=out)
     for request in plan_requests(wanted):
         whole = request.region
         town = whole.extract[-1].town.model_copy(update={"size_m": 1280.0})

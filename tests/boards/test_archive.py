@@ -16,7 +16,7 @@ from sasgeo_bench.boards import archive, archive_file, build, score
 from sasgeo_bench.boards.archive import laid_out, pack_board, score_all, stored_settings
 from sasgeo_bench.boards.archive_file import read_pack, read_stored_predictions, unpack, unpack_tasks
 from sasgeo_bench.boards.board_figures import figures_extra
-from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.boards.board_files import AdditionalFiles
 from sasgeo_bench.boards.pipeline_spec import PipelineFile
 from sasgeo_bench.boards.publish import publish
 from sasgeo_bench.boards.scored import ScoreRequest
@@ -78,7 +78,7 @@ def kept(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
 def undrawn(monkeypatch):
     """Boards of stored results have no figures and no pictures: for tests that are about their tables."""
     for name in ("figures_extra", "pictures_extra"):
-        monkeypatch.setattr(build, name, lambda *_, **__: Extra())
+        monkeypatch.setattr(build, name, lambda *_, **__: AdditionalFiles())
 
 
 def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path):
@@ -99,7 +99,7 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
     said["files"]["queries.parquet"]["sha256"] = "0" * 64
     (other / "task.json").write_text(json.dumps(said), encoding="utf-8")
     lines = []
-    monkeypatch.setattr(build, "figures_extra", lambda *_, **__: Extra())
+    monkeypatch.setattr(build, "figures_extra", lambda *_, **__: AdditionalFiles())
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path / "out")
     with reporting(lines.append):
         score_all(replace(usual, draws=100, rejectors=()))

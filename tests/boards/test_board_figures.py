@@ -32,7 +32,7 @@ from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.sasgeo.conformal import level_name
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
-from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
+from sasgeo_bench.scoring.contrasts import Contrast, by_place, evaluate_contrasts
 from sasgeo_bench.scoring.decisions import calibration_error
 from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.protection import protection_frame, protection_levels
@@ -90,7 +90,7 @@ def board(tmp_path_factory):
             folder=tmp_path_factory.mktemp("board"),
             about=about_of([]),
             leaderboard=pd.concat([table, *rows], ignore_index=True),
-            contrasts=CONTRAST_SCHEMA.frame(hold_contrasts(CONTRASTS, tables, judged, draws=100)),
+            contrasts=CONTRAST_SCHEMA.frame(evaluate_contrasts(CONTRASTS, tables, judged, draws=100)),
         ),
         failures=Failures(tmp_path_factory.mktemp("log") / "failures.log"),
         scores=tables,
@@ -319,7 +319,7 @@ def test_a_contrast_at_one_place_is_that_of_a_board_of_the_place(board, contrast
     for one in places:
         here = {name: frame[frame["place"] == one.place] for name, frame in board.scores.items()}
         judged = {key: frame[frame["place"] == one.place] for key, frame in board.judged.items()}
-        (alone,) = hold_contrasts([contrast], here, judged, draws=100)
+        (alone,) = evaluate_contrasts([contrast], here, judged, draws=100)
         assert (one.n, one.blocks) == (alone.n, alone.blocks)
         assert one.difference == pytest.approx(alone.difference)
         assert one.lo <= one.difference <= one.hi

@@ -11,7 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from sasgeo_bench.boards.board_files import Extra, check_board, read_leaderboard, write_board
+from sasgeo_bench.boards.board_files import AdditionalFiles, check_board, read_leaderboard, write_board
 from sasgeo_bench.boards.manifests import BoardManifest
 from sasgeo_bench.core.errors import StoreError
 
@@ -19,13 +19,13 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from tests.boards.test_board_files import put
-from sasgeo_bench.boards.board_files import Extra
+from sasgeo_bench.boards.board_files import AdditionalFiles
 
 def draw(path):
     path.write_bytes(b"half")
     os.kill(os.getpid(), signal.SIGKILL)
 
-put(Path(sys.argv[1]), 2.0, extras=[Extra(figures={"mine.png": draw})])
+put(Path(sys.argv[1]), 2.0, extras=[AdditionalFiles(figures={"mine.png": draw})])
 """
 
 
@@ -35,7 +35,7 @@ def put(folder, value, *, extras=(), version=1):
         folder,
         tables={"leaderboard": table, "scores": table},
         about=BoardManifest(scorer_version=version, entries=[], tasks=[]),
-        extras=[Extra(texts={"leaderboard.md": f"{value}\n"}), *extras],
+        extras=[AdditionalFiles(texts={"leaderboard.md": f"{value}\n"}), *extras],
     )
 
 
@@ -73,7 +73,7 @@ def test_a_full_disk_is_one_line_and_the_old_board_stays(board):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(StoreError, match=r"mine cannot be written \(No space left on device\): check the free space"):
-        put(board, 2.0, extras=[Extra(figures={"mine.png": fill})])
+        put(board, 2.0, extras=[AdditionalFiles(figures={"mine.png": fill})])
     assert contents(board) == before
     assert sorted(path.name for path in board.parent.iterdir()) == ["mine"]
 

@@ -17,7 +17,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.tasks import flight_sampling, task_files
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 SUITE, REGION = "flight-overconfident", "town-riverside"
 HASH = "0" * 12
@@ -54,7 +54,9 @@ def run(out, name, *, off_m, accepts):
 def out(tmp_path_factory, lay_towns):
     """A root with two trackers, their board in boards/mine, and its stored results in results/mine."""
     root = lay_towns(tmp_path_factory.mktemp("flights") / "out", REGION)
-    wanted = Wanted(suites=(SUITE,), regions=(REGION,), split="crossfit", count=2, seed=0, out=root, may_be_fewer=True)
+    wanted = TaskRequest(
+        suites=(SUITE,), regions=(REGION,), split="crossfit", count=2, seed=0, out=root, may_be_fewer=True
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
         for request in plan_requests(wanted):

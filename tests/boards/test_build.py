@@ -18,7 +18,7 @@ import pytest
 
 from sasgeo_bench import cli
 from sasgeo_bench.boards import score as boards
-from sasgeo_bench.boards.board_files import Extra, read_board_manifest, read_leaderboard
+from sasgeo_bench.boards.board_files import AdditionalFiles, read_board_manifest, read_leaderboard
 from sasgeo_bench.boards.build import make_board
 from sasgeo_bench.boards.manifests import PipelineRecord
 from sasgeo_bench.boards.scored import ScoreRequest
@@ -43,7 +43,7 @@ from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, make_split, read_split_file
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.plain_boards import plain_boards
 from tests.slow import rest_slow
 
@@ -79,7 +79,9 @@ class Own(Doubt):
 def built(tmp_path_factory, lay_towns):
     """Two towns, a task each in which every fourth place is made absent, a run of the control that has the truth."""
     out = lay_towns(tmp_path_factory.mktemp("boards") / "out", *TOWNS)
-    wanted = Wanted(suites=("clean",), regions=TOWNS, split="crossfit", count=2, seed=2, out=out, may_be_fewer=True)
+    wanted = TaskRequest(
+        suites=("clean",), regions=TOWNS, split="crossfit", count=2, seed=2, out=out, may_be_fewer=True
+    )
     for request in plan_requests(wanted):
         make_tasks(request)
     tasks = [out / "tasks" / "clean" / town for town in TOWNS]
@@ -260,7 +262,7 @@ def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_
     assert not {"brier", "cost_20"} & set(order[order["rejector"] == "order"]["metric"])
     rows = board.board.leaderboard[board.board.leaderboard["rejector"] == "doubt"]
     by_name = {row["metric"]: row for _, row in rows[rows["stratum"] == "as drawn"].iterrows()}
-    assert by_name["brier"]["value"] == 0.0  # all answers were right, and none was doubted
+    assert by_name["brier"]["value"] == 0.0  # all answers were right, and none was with_unknown_margins
     assert by_name["coverage_at_risk_0.01"]["value"] == pytest.approx(
         by_name["aurc"]["answered"] / by_name["aurc"]["n"]
     )
@@ -742,7 +744,7 @@ def test_a_control_that_fails_is_told_first_and_ends_with_its_own_status(out, mo
     verdict = Verdict(
         control="shuffled map at chance", matcher="random", n=8, found=8.0, expected=0.8, p=1e-8, holds=False
     )
-    monkeypatch.setattr(boards, "hold_controls", lambda _: (verdict,))
+    monkeypatch.setattr(boards, "evaluate_controls", lambda _: (verdict,))
     words = ("score", "--predictions", str(out / "runs"), "--out", str(out), "--name", "mine", "--draws", "200")
     monkeypatch.setattr("sys.argv", ["sasgeo-bench", *words])
     with pytest.raises(SystemExit) as left:
@@ -760,7 +762,7 @@ def test_a_rival_that_knows_too_much_is_set_apart_and_the_board_stands(out, tmp_
     submission(out, tmp_path / "mine.parquet")
     chance = {"n": 8, "found": 8.0, "expected": 0.8, "p": 1e-8}
     failed = Verdict(control="shuffled map at chance", matcher="mine", holds=False, **chance)
-    monkeypatch.setattr(boards, "hold_controls", lambda _: (failed, replace(failed, matcher="random", holds=True)))
+    monkeypatch.setattr(boards, "evaluate_controls", lambda _: (failed, replace(failed, matcher="random", holds=True)))
     given = ("--predictions", out / "runs", "--predictions", tmp_path / "mine.parquet")
     code, _, err = program("score", *given, "--out", out, "--name", "both", "--draws", "200", "--no-cases")
     assert code == CONTESTANT_FAILED
@@ -890,7 +892,7 @@ def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out,
 
 def fails_with(monkeypatch, name, is_bad):
     """A mistake of ours that only what one contestant says brings about."""
-    room = {"scored": entries._Asked, "hold_controls": entries, "leaderboard": tables}.get(name, boards)
+    room = {"scored": entries._Asked, "evaluate_controls": entries, "leaderboard": tables}.get(name, boards)
     work = getattr(room, name)
 
     def broken(*words, **more):
@@ -905,7 +907,7 @@ def fails_with(monkeypatch, name, is_bad):
     ("step", "is_bad"),
     [
         ("scored", lambda _, answers: any(row.diagnostics["told"] == 2.0 for row in answers.found.values())),
-        ("hold_controls", lambda scored: "bad" in scored),
+        ("evaluate_controls", lambda scored: "bad" in scored),
         ("leaderboard", lambda scores, **_: "bad" in scores),
     ],
 )
@@ -944,7 +946,7 @@ def test_a_figure_that_cannot_be_drawn_leaves_the_others(out, both):
         drawn(path)
         raise ValueError(path.name)
 
-    board = board_of(out, *both, extras=[lambda _: Extra(figures={"age.svg": drawn, "risk.svg": broken})])
+    board = board_of(out, *both, extras=[lambda _: AdditionalFiles(figures={"age.svg": drawn, "risk.svg": broken})])
     assert list(board.failures.found) == ["figure risk.svg"]
     assert [path.name for path in (out / "boards" / "mine" / "figures").iterdir()] == ["age.svg"]
     assert list(read_board_manifest(out / "boards" / "mine").failed) == ["figure risk.svg"]

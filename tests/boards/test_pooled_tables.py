@@ -20,7 +20,7 @@ from sasgeo_bench.boards.pooled_plots import (
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running.prediction_files import StoredAnswers
-from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.scoring.contrasts import Contrast, evaluate_contrasts
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.rejection import own_confidence
 from sasgeo_bench.scoring.rejection_rows import integrity_rows
@@ -135,7 +135,7 @@ def test_a_pool_is_that_of_its_contrasts_and_has_those_who_were_asked_all_of_it(
         Contrast(name=name, first="one", second="two", suites=("occlusion",), kinds=kinds)
         for name, kinds in (("a", ()), ("b", ()), ("c", ("U1",)))
     ]
-    (finding, *_) = hold_contrasts(contrasts, tables, {}, draws=100)
+    (finding, *_) = evaluate_contrasts(contrasts, tables, {}, draws=100)
     rows = ablation_frame(tables, contrasts, ["one", "two", "spared"])
     assert list(dict.fromkeys(rows["pool"])) == ["a, b", "c"]
     mine = rows[rows["pool"] == "a, b"].set_index("matcher")

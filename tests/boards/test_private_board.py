@@ -33,7 +33,7 @@ from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.rows import PACKED
 from sasgeo_bench.tasks.build import ensure_tasks
 from sasgeo_bench.tasks.private_seed import PrivateSeed
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.scoring.test_tables import scores
 
 pytestmark = pytest.mark.usefixtures("few_figures")
@@ -137,7 +137,9 @@ def made(tmp_path_factory):
         patch.chdir(root)
         patch.syspath_prepend(str(root))
         for out, seed in ((root / "out", 7), (root / "out" / "private", SEED)):
-            wanted = Wanted(suites=("clean",), regions=("town-suburb",), split="crossfit", count=4, seed=seed, out=out)
+            wanted = TaskRequest(
+                suites=("clean",), regions=("town-suburb",), split="crossfit", count=4, seed=seed, out=out
+            )
             for request in plan_requests(replace(wanted, may_be_fewer=True)):
                 tasks = ensure_tasks(request)
                 run(plan_run(RunRequest(spec="redrawer:Redrawer", tasks=tasks, out=out)))

@@ -507,7 +507,7 @@ def test_a_ceiling_below_one_is_explained_with_the_oracle_that_passes_it():
     most = many_rows(3).assign(metric="ceiling", value=0.625)
     (table,) = summary(book_of(source(pd.concat([many_rows(3), most], ignore_index=True))))
     assert [cell.text for cell in table.rows[1].cells] == ["at most", "0.625"]
-    assert table.notes[-1].endswith("An oracle is told the answer and passes it.")
+    assert table.notes[-1].endswith("An oracle gets the answer and passes it.")
     (plain,) = summary(book_of(source()))
     assert not any(note.startswith("at most") for note in plain.notes)
 

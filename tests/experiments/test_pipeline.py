@@ -506,7 +506,7 @@ def test_a_half_without_a_place_is_told_before_anything_is_asked(tmp_path):
     one = plan_pipeline(taught_by("", LEARNING.replace('"town-suburb", ', "")), out=tmp_path)
     told = one.training_groups.lines(one.requests)
     assert [line for line in told if "has no place here" in line] == [
-        "    half a has no place here: nobody learns for half b"
+        "    half a has no place here: none learns for half b"
     ]
 
 

@@ -118,7 +118,7 @@ def test_what_of_a_file_is_not_read_is_told_in_one_line(written: Callable, name:
         text += "".join(f"\n1,{at + 1}" + ",5" * 99 for at in range(2))
     last = read_log(
         written(name, text), LogFacts(time_unit="none") if name in ("a.csv", "c.csv", "d.csv") else None
-    ).told[-1]
+    ).notes[-1]
     assert last.startswith(f"not read: {told}")
     assert last.isprintable()
     assert len(last) < 600

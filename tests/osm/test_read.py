@@ -340,7 +340,7 @@ def test_a_file_is_held_against_the_day_that_is_stated(at, newest, header, count
     assert told is None if said is None else said in told
 
 
-@pytest.mark.parametrize(("year", "is_told"), [(1999, True), (None, False)])
-def test_a_wrong_date_of_an_extract_is_a_warning(toytown, toygrid, year, is_told):
+@pytest.mark.parametrize(("year", "is_reported"), [(1999, True), (None, False)])
+def test_a_wrong_date_of_an_extract_is_a_warning(toytown, toygrid, year, is_reported):
     at = None if year is None else dt.date(year, 1, 1)
-    assert any("state the day" in told for told in read_extract(toytown, toygrid, at=at).warnings) == is_told
+    assert any("state the day" in told for told in read_extract(toytown, toygrid, at=at).warnings) == is_reported

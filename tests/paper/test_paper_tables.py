@@ -17,7 +17,7 @@ from sasgeo_paper.tables import (
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
-from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.scoring.contrasts import Contrast, evaluate_contrasts
 from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.scoring.score import COLUMNS
 from sasgeo_bench.scoring.tables import leaderboard
@@ -216,7 +216,7 @@ def test_the_document_holds_steps_between_variants_and_controls_apart(trials):
     step = Contrast(
         name="unknown", first="full_unknown", second="raster_graph_stability", suites=("paper-poc",), track="retrieval"
     )
-    findings = hold_contrasts([step], scores, {}, draws=200)
+    findings = evaluate_contrasts([step], scores, {}, draws=200)
     summary = summary_frame(
         trials, board_of({"full_unknown": scores["full_unknown"], "random": scored(TRUTHS, [0] * 8)})
     )

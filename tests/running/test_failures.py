@@ -7,7 +7,7 @@ import pytest
 
 from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.core.progress import reporting
-from sasgeo_bench.running.failures import LOG, Failures, stops_all
+from sasgeo_bench.running.failures import LOG, Failures, is_disk_error
 
 
 class UnspeakableError(RuntimeError):
@@ -40,8 +40,8 @@ def test_a_named_fault_stands_in_its_own_words_and_once(tmp_path):
 def test_a_full_disk_stops_all_and_a_fault_of_one_does_not():
     full = StoreError("full")
     full.__cause__ = OSError(errno.ENOSPC, "No space left on device")
-    assert stops_all(full)
-    assert not stops_all(ValueError("mine"))
+    assert is_disk_error(full)
+    assert not is_disk_error(ValueError("mine"))
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])

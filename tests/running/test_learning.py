@@ -22,7 +22,7 @@ from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.training_tasks import Lessons, _Pair, check_apart, plan_training, spread
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.scoring.submission_files import set_aside, validate
+from sasgeo_bench.scoring.submission_files import count_excluded, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import SplitFile, make_split
 
@@ -88,7 +88,7 @@ def test_what_was_learnt_reaches_every_answer_and_is_kept_where_people_can_read_
     assert next(
         validate(folder, [*map(task_files.Task.open, request.tasks)])
     ).is_missing_row  # the rest was not asked, and no row is strange
-    assert set_aside(folder, [*map(task_files.Task.open, request.tasks)]) == 0
+    assert count_excluded(folder, [*map(task_files.Task.open, request.tasks)]) == 0
     merged = prediction_files.merge_runs(
         [folder], folder / "merged.parquet", asked=task_files.Task.open(request.tasks[0]).asked
     )
@@ -105,12 +105,12 @@ def test_what_was_learnt_is_used_again_and_learnt_anew_from_something_else(reque
     assert carry_out(replace(request, limit=3))[1].counts == {"ok": 1}
     monkeypatch.setattr(training, "_learn", learn)
     other = replace(request, most_trained=3, limit=3)
-    assert plan_run(other).parts[0].aside == 3
+    assert plan_run(other).parts[0].excluded == 3
     second, report, same = carry_out(other)
     assert (same, report.counts, second.training_set.count) == (folder, {"ok": 3}, 3)
     assert first.training_set.sha256 != second.training_set.sha256
     assert told(request, folder) == {3.0}
-    assert set_aside(folder, [*map(task_files.Task.open, request.tasks)]) == 3
+    assert count_excluded(folder, [*map(task_files.Task.open, request.tasks)]) == 3
     # Back again, nothing is asked, and the answers under the first training are those that count.
     monkeypatch.setattr(training, "_learn", None)
     assert carry_out(replace(request, limit=3))[1].counts == {}

@@ -11,7 +11,7 @@ from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.running import answers, prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.scoring.submission_files import set_aside, validate
+from sasgeo_bench.scoring.submission_files import count_excluded, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import PriorGroup
 from tests import world
@@ -55,16 +55,16 @@ def test_more_sites_fewer_sites_and_another_seed_ask_nothing_twice(draw):
     draw(seed=1)
     other = set(task_files.Task.open(task).ids())
     part, asked = ask(task)
-    assert (asked, part.done, part.aside) == (len(other), 0, len(more))
+    assert (asked, part.done, part.excluded) == (len(other), 0, len(more))
     draw()
     part, asked = ask(task)
-    assert (part.left, asked, part.done, part.aside) == ((), 0, len(few), len(more - few) + len(other))
+    assert (part.left, asked, part.done, part.excluded) == ((), 0, len(few), len(more - few) + len(other))
     draw(count=2)
     assert ask(task)[1] == 0
     # All of it is there, and every task is answered by its own.
     assert {row.query_id for row in prediction_files.read_predictions(part.folder)} == more | other
     assert list(validate(part.folder, [task_files.Task.open(task)])) == []
-    assert set_aside(part.folder, [task_files.Task.open(task)]) == len(other)
+    assert count_excluded(part.folder, [task_files.Task.open(task)]) == len(other)
 
 
 def test_a_query_whose_content_changed_is_asked_again_and_both_answers_stay(draw, tmp_path):
@@ -77,13 +77,13 @@ def test_a_query_whose_content_changed_is_asked_again_and_both_answers_stay(draw
     assert not set(before.values()) & set(after.values())
     assert len(list(validate(folder, [task_files.Task.open(task)]))) == len(after)
     part, asked = ask(task)
-    assert (asked, part.aside) == (len(after), len(before))
+    assert (asked, part.excluded) == (len(after), len(before))
     with pytest.raises(StoreError, match="and to an earlier version of it: name the tasks with --tasks"):
         prediction_files.merge_runs([folder], tmp_path / "both.parquet")
     assert prediction_files.merge_runs([folder], tmp_path / "mine.parquet", asked=after) == len(after)
     assert list(validate(tmp_path / "mine.parquet", [task_files.Task.open(task)])) == []
     found = prediction_files.Answers.open(folder, before)
-    assert (found.found.keys(), found.aside) == (before.keys(), len(after))
+    assert (found.found.keys(), found.excluded) == (before.keys(), len(after))
     draw(prior="r500-weak-s3")
     assert ask(task)[1] == 0
 

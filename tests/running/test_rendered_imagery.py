@@ -67,7 +67,7 @@ def test_only_who_looks_at_imagery_is_asked_again_after_it_was_rendered_anew(dra
     assert not list(validate(plan_of(seen, "orb_vlad").parts[0].folder, [Task.open(seen)]))
 
     render_imagery(folder, folder, replace(LOOK, seed=1))
-    assert plan_of(seen, "orb_vlad").parts[0].aside == 2 * count
+    assert plan_of(seen, "orb_vlad").parts[0].excluded == 2 * count
     assert ask(seen, "orb_vlad") == {"ok": count}
     assert not ask(plain, "oracle_pose")
     shutil.rmtree(folder)

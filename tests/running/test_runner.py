@@ -202,13 +202,13 @@ def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task
 
 def test_a_run_without_isolation_is_another_run_and_says_what_it_lacked(task, tmp_path):
     _, shut_in = run_all(request_of(task, tmp_path, limit=1))
-    report, trusted = run_all(request_of(task, tmp_path, name="Raises", limit=1, is_shut_in=False))
+    report, trusted = run_all(request_of(task, tmp_path, name="Raises", limit=1, is_sandboxed=False))
     assert shut_in.parent != trusted.parent
     said = RunManifest.open(trusted).isolation
     assert set(said) == set(RunManifest.open(shut_in).isolation) == set(PROMISES)
     assert {words for name, words in said.items() if name != "memory"} == {"trusted code, not shut in"}
     assert list(report.messages) == ["crash"]
-    same = plan_run(request_of(task, tmp_path, limit=1, is_shut_in=False)).parts[0].folder
+    same = plan_run(request_of(task, tmp_path, limit=1, is_sandboxed=False)).parts[0].folder
     assert same != shut_in
 
 

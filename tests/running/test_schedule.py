@@ -6,7 +6,7 @@ from itertools import chain
 
 import pytest
 
-from sasgeo_bench.running.answers import LEAST_ITEMS, Schedule, pays
+from sasgeo_bench.running.answers import LEAST_ITEMS, Schedule, is_worth_starting
 
 
 class Clock:
@@ -58,7 +58,7 @@ def test_two_that_ask_about_one_map_get_each_query_once():
     ],
 )
 def test_help_pays_where_its_share_takes_as_long_as_its_start(left, askers, start_s, pace_s, expected):
-    assert pays(left=left, askers=askers, start_s=start_s, pace_s=pace_s) is expected
+    assert is_worth_starting(left=left, askers=askers, start_s=start_s, pace_s=pace_s) is expected
 
 
 @pytest.mark.parametrize(("pace_s", "is_helped"), [(1.0, True), (0.1, False)])

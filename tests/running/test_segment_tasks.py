@@ -30,7 +30,7 @@ from sasgeo_bench.tasks.query import Step, view_id
 from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import TaskOrigin, TruthManifest
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 TOWNS = ("town-grid", "town-riverside")  # of either half
 PATIENT = Limits(match_s=600.0, learn_s=600.0, memory_bytes=2 * 10**9)
@@ -60,7 +60,9 @@ def drawn_once(tmp_path_factory, lay_towns):
     """A root with tasks of four pictures in each of two towns, and their folders in it."""
     out = tmp_path_factory.mktemp("pictured") / "out"
     lay_towns(out, *TOWNS)
-    wanted = Wanted(suites=("clean",), regions=TOWNS, split="crossfit", count=1, seed=4, out=out, may_be_fewer=True)
+    wanted = TaskRequest(
+        suites=("clean",), regions=TOWNS, split="crossfit", count=1, seed=4, out=out, may_be_fewer=True
+    )
     folders = []
     for request in plan_requests(wanted):
         (made,) = make_tasks(request)

@@ -69,7 +69,7 @@ def test_what_a_segmenter_may_do_is_no_fault(table, name) -> None:
         ("NoCard", 0, "card is a NoneType"),
         ("Imitates", 0, "named 'oracle_segmenter', as a segmenter that ships: rename it"),
         ("WrongShape", 1, "image 0: invalid: segment() returned a segmentation of shape (4, 4)"),
-        ("UnknownClass", 1, "told the class 'volcano'"),
+        ("UnknownClass", 1, "returned the class 'volcano'"),
         ("NotOnItsCard", 1, "(4 of 4 images)"),
         ("PaintsOver", 1, "changed the picture that it was given"),
         ("Fickle", 2, "image 0 has another answer the second time"),

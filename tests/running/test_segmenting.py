@@ -161,7 +161,7 @@ def test_a_segmenter_sees_no_labels_of_what_it_is_asked(request_of, tmp_path) ->
         write_labelled(tmp_path / folder, tiny_images())
     (reply,) = told(request_of("LooksForLabels"), tiny_images()[0])
     assert int(reply.found.probability_bytes.max()) == 0
-    (reply,) = told(request_of("LooksForLabels", is_shut_in=False), tiny_images()[0])
+    (reply,) = told(request_of("LooksForLabels", is_sandboxed=False), tiny_images()[0])
     assert int(reply.found.probability_bytes.min()) == 12
 
 
@@ -171,7 +171,7 @@ def test_a_segmenter_that_learns_sees_no_labels_but_those_it_learns_from(request
     own, mine, *_ = (LabelledFiles(write_labelled(tmp_path / folder, tiny_images())) for folder in folders)
     for given in (own, mine):
         assert train_segmenter(request_of("CountsLabels"), given).learned == "0 beside 4"
-    assert train_segmenter(request_of("CountsLabels", is_shut_in=False), own).learned == "12 beside 4"
+    assert train_segmenter(request_of("CountsLabels", is_sandboxed=False), own).learned == "12 beside 4"
 
 
 @pytest.mark.parametrize(

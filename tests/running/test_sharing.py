@@ -151,17 +151,17 @@ def test_rows_are_written_while_the_next_query_hangs(pair, tmp_path, monkeypatch
 
 def test_a_second_run_waits_for_the_folders_of_the_first(pair, tmp_path):
     plan = plan_run(RunRequest(spec="oracle_pose", tasks=pair, out=tmp_path, limit=1))
-    lines, is_told = [], threading.Event()
+    lines, is_reported = [], threading.Event()
 
     def tell(line):
         lines.append(line)
-        is_told.set()
+        is_reported.set()
 
     second = threading.Thread(target=run, args=(plan,))
     with reporting(tell):
         with locked(plan.parts[1].folder):
             second.start()
-            assert is_told.wait(600)
+            assert is_reported.wait(600)
             assert not plan.parts[0].folder.exists()
         second.join()
     assert lines == [f"{plan.parts[1].folder} is being written by another run, waiting for it"]

@@ -171,7 +171,7 @@ def test_one_that_is_shut_in_fails_by_what_it_was_refused(own_place) -> None:
 
 
 def test_one_that_is_trusted_fails_by_what_it_left_behind(own_place) -> None:
-    rows = by_name(check_matcher("faulty:WritesAmongMaps", place=own_place, is_shut_in=False))
+    rows = by_name(check_matcher("faulty:WritesAmongMaps", place=own_place, is_sandboxed=False))
     assert failed(rows) == ["kept to its scratch folder"]
     assert rows["kept to its scratch folder"].found == "wrote among maps and tasks: regions/mine.txt"
 

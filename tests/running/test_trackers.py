@@ -203,7 +203,7 @@ def test_a_matcher_of_single_views_follows_flights_and_its_run_says_how(task, tm
     monkeypatch.setattr(follower, "_VERSION", 0)
     again = plan_run(plan.request)
     assert again.hash == plan.hash
-    assert (len(again.parts[0].left), again.parts[0].aside) == (4, 4)
+    assert (len(again.parts[0].left), again.parts[0].excluded) == (4, 4)
     with pytest.raises(ValueError, match="follower is 7, expected settings with a hash"):
         RunManifest.model_validate({"follower": 7})
 

@@ -25,11 +25,13 @@ HAS_LANDLOCK = sandbox.landlock_version() > 0
 shut_in = pytest.mark.skipif(not HAS_LANDLOCK, reason="this kernel has no Landlock to refuse files with")
 
 
-def ask(place, task, name, *, limits=PATIENT, times=1, is_shut_in=True, kind=Worker):
+def ask(place, task, name, *, limits=PATIENT, times=1, is_sandboxed=True, kind=Worker):
     """The replies of a hostile matcher to the first query, and its worker after its end."""
     query = task_files.query_bytes(next(iter(task_files.read_queries(task))))
     region = place / "out" / "regions" / task.name
-    reach = Reach(readable=[region], hidden=[place / "out" / "truth", place / "out" / "runs"], is_shut_in=is_shut_in)
+    reach = Reach(
+        readable=[region], hidden=[place / "out" / "truth", place / "out" / "runs"], is_sandboxed=is_sandboxed
+    )
     with kind(spec=f"hostile:{name}", reach=reach, limits=limits) as worker:
         ready = worker.prepare(region)
         if ready.status != "ok":
@@ -127,7 +129,7 @@ def test_an_end_between_two_questions_costs_one_and_the_map_is_prepared_again(pl
 def test_the_truth_is_out_of_reach(place, task):
     (reply,), worker = ask(place, task, "ReadsTruth")
     assert "read the truth" not in reply.message
-    (trusted,), _ = ask(place, task, "ReadsTruth", is_shut_in=False)
+    (trusted,), _ = ask(place, task, "ReadsTruth", is_sandboxed=False)
     assert "read the truth" in trusted.message  # it looks in the right place
     (listed,), _ = ask(place, task, "ListsFolders")
     assert listed.found.diagnostics["truth files"] == 0
@@ -144,7 +146,7 @@ def test_truths_of_other_runs_beside_the_code_are_out_of_reach_too(place, task, 
     monkeypatch.syspath_prepend(str(other.parent))
     (reply,), _ = ask(place, task, "ReadsTruth")
     assert "read the truth" not in reply.message
-    (trusted,), _ = ask(place, task, "ReadsTruth", is_shut_in=False)
+    (trusted,), _ = ask(place, task, "ReadsTruth", is_sandboxed=False)
     assert "read the truth" in trusted.message
 
 
@@ -181,7 +183,7 @@ def test_whatever_beside_the_code_tells_answers_is_out_of_reach(place, task, tmp
     (reply,), worker = ask(place, task, "ReadsAllBeside")
     assert reply.found.diagnostics == {"told": 1}, "the harmless one alone"
     assert "not looked for" not in worker.isolation["truth"]
-    (trusted,), _ = ask(place, task, "ReadsAllBeside", is_shut_in=False)
+    (trusted,), _ = ask(place, task, "ReadsAllBeside", is_sandboxed=False)
     assert trusted.found.diagnostics["told"] > len(names) + 1
 
 
@@ -212,7 +214,7 @@ def test_command_lines_of_others_are_out_of_reach(place, task):
     with subprocess.Popen(command) as other:  # noqa: S603 - ours
         try:
             (reply,), worker = ask(place, task, "ReadsCommandLines")
-            (trusted,), _ = ask(place, task, "ReadsCommandLines", is_shut_in=False)
+            (trusted,), _ = ask(place, task, "ReadsCommandLines", is_sandboxed=False)
         finally:
             other.kill()
     assert reply.found.diagnostics["secrets"] == 0
@@ -261,7 +263,7 @@ def test_nothing_is_left_of_a_matcher(place, task, name):
 def test_an_answer_that_came_before_its_question_is_refused_and_the_process_is_replaced(place, task):
     replies, worker = ask(place, task, "AnswersInAdvance", limits=PATIENT, times=3)
     assert [reply.status for reply in replies] == ["ok", "invalid", "ok"]
-    assert "it was not made for this question" in replies[1].message
+    assert "reply does not belong to this query" in replies[1].message
     assert worker.starts == 2
 
 

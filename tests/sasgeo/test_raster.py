@@ -14,11 +14,11 @@ from sasgeo_bench.sasgeo.raster import (
     REPEATED,
     RasterView,
     burnt,
-    doubted,
     likeness_by_hand,
     line_width_m,
     read_field,
     store_field,
+    with_unknown_margins,
 )
 from sasgeo_bench.sasgeo.rates import hand_rates
 from sasgeo_bench.sasgeo.weights import STRATA, even_gains, likelihood_gains
@@ -69,7 +69,7 @@ def test_noise_free_views_are_found_on_a_town(tiny, field):
     whole = [(query, pose) for query, pose in whole if query.track == "localization" and query.evidence.shape[0] >= 192]
     assert len(whole) >= 3
     for query, pose in whole:
-        seen = doubted(query.evidence)
+        seen = with_unknown_margins(query.evidence)
         view = RasterView.of(seen, tiny.region.classes, even_gains(np.ones(len(tiny.region.classes))))
         best = search(field, view.template(), query.prior).modes[0].pose
         assert (
@@ -80,7 +80,7 @@ def test_noise_free_views_are_found_on_a_town(tiny, field):
 def test_a_line_of_the_map_beside_a_seen_one_is_no_miss():
     row = np.zeros((2, 1, 30), dtype=np.uint8)
     row[:, 0, 10] = PRESENT
-    open_ = doubted(Evidence(classes=("railway", "building"), cells=row, cell_size_m=1.0))
+    open_ = with_unknown_margins(Evidence(classes=("railway", "building"), cells=row, cell_size_m=1.0))
     assert np.flatnonzero(open_.layer("railway")[0] == UNKNOWN).tolist() == [*range(2, 10), *range(11, 19)]
     assert (open_.layer("building") == row[1]).all()
 

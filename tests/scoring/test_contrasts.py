@@ -10,7 +10,7 @@ import pytest
 from sasgeo_bench.boards.board_tables import contrast_table
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.scoring import compare
-from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.scoring.contrasts import Contrast, evaluate_contrasts
 from sasgeo_bench.scoring.intervals import wilson
 from tests.scoring.test_tables import scores
 
@@ -29,7 +29,7 @@ def errors(share, count=600, seed=1):
 
 
 def held(contrast, judged=None, **tables):
-    return hold_contrasts([contrast], tables, judged or {}, draws=400)[0]
+    return evaluate_contrasts([contrast], tables, judged or {}, draws=400)[0]
 
 
 def test_a_real_difference_is_found_with_its_discordant_pairs():
@@ -203,7 +203,7 @@ def test_an_area_that_is_not_defined_decides_nothing_and_loosens_no_other_test()
     sides = {"first": "mine x logistic", "second": "mine x margin"}
     undefined = replace(CONTRAST, name="rejection", metric="auroc", **sides)
     tables = {"with": scores(errors(0.62), blocks=60), "without": scores(errors(0.58), blocks=60)}
-    area, graph = hold_contrasts([undefined, CONTRAST], tables, judged, draws=400)
+    area, graph = evaluate_contrasts([undefined, CONTRAST], tables, judged, draws=400)
     assert (area.outcome, area.p_holm) == ("not decided", 1.0)
     assert graph.p_holm == pytest.approx(min(1.0, 2 * graph.p_places))
 
@@ -211,8 +211,8 @@ def test_an_area_that_is_not_defined_decides_nothing_and_loosens_no_other_test()
 def test_holm_is_over_all_that_were_registered():
     better, worse = errors(0.62), errors(0.58)
     tables = {"with": scores(better, blocks=60), "without": scores(worse, blocks=60)}
-    alone = hold_contrasts([CONTRAST], tables, {}, draws=400)[0]
-    both = hold_contrasts([replace(CONTRAST, name=name) for name in "ab"], tables, {}, draws=400)
+    alone = evaluate_contrasts([CONTRAST], tables, {}, draws=400)[0]
+    both = evaluate_contrasts([replace(CONTRAST, name=name) for name in "ab"], tables, {}, draws=400)
     assert both[0].p_holm == pytest.approx(min(1.0, 2 * alone.p_holm))
 
 

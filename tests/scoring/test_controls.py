@@ -10,10 +10,10 @@ from sasgeo_bench.boards.text import control_lines
 from sasgeo_bench.scoring.controls import (
     at_least,
     chances,
+    evaluate_controls,
     failed_controls,
     hits,
-    hold_controls,
-    knows_too_much,
+    reason_implausible,
 )
 from sasgeo_bench.tasks.query import BLIND, NOISE_FREE, SHUFFLED, TURNED, TWINS
 
@@ -44,7 +44,7 @@ def rows(kind, right, *, track="retrieval", pool=10, **changes):
 
 
 def held(frame, matcher="mine"):
-    return {item.control: item for item in hold_controls({matcher: frame})}
+    return {item.control: item for item in evaluate_controls({matcher: frame})}
 
 
 def test_at_least_is_the_binomial_tail_and_poissons():
@@ -125,7 +125,7 @@ def test_what_is_no_control_has_no_verdict():
 
 
 def test_lines_say_what_failed_first():
-    verdicts = hold_controls({"random": rows(SHUFFLED, [1] * 8), "other": rows(SHUFFLED, [0] * 8)})
+    verdicts = evaluate_controls({"random": rows(SHUFFLED, [1] * 8), "other": rows(SHUFFLED, [0] * 8)})
     assert [item.holds for item in verdicts] == [False, True]
     first, second = control_lines(verdicts)
     assert first == "CONTROLS FAILED, 1 of 2: do not trust this board."
@@ -135,7 +135,7 @@ def test_lines_say_what_failed_first():
 
 
 def test_a_rival_that_fails_a_control_spoils_its_own_rows_alone():
-    verdicts = hold_controls(
+    verdicts = evaluate_controls(
         {
             "mine": rows(SHUFFLED, [1] * 8),
             "yours 2 (ab12cd)": rows(BLIND, [0] * 4),
@@ -154,7 +154,7 @@ def test_a_rival_that_fails_a_control_spoils_its_own_rows_alone():
     assert [item.control for item in failed_controls(verdicts, "mine")] == ["shuffled map at chance"]
     assert failed_controls(verdicts, "fft_vote") == ()
     # To answer a view that shows nothing is unwise; to find the place on a shuffled map is to know it from elsewhere.
-    assert knows_too_much(verdicts, "mine") == (
+    assert reason_implausible(verdicts, "mine") == (
         'right 8 of 8 times at the control "shuffled map at chance", where guessing is right 0.8 times'
     )
-    assert knows_too_much(verdicts, "yours 2 (ab12cd)") is None
+    assert reason_implausible(verdicts, "yours 2 (ab12cd)") is None

@@ -7,7 +7,7 @@ import pytest
 from sasgeo_bench.boards.board_tables import falsifier_table
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, hold_falsifiers
+from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, evaluate_falsifiers
 from tests.scoring.test_tables import scores
 
 CONTRAST = Contrast(name="graph", first="with", second="without", suites=("occlusion",), kinds=("U2",))
@@ -32,7 +32,7 @@ def held(first, second, **columns):
         name: table(errors, roles=ROLES, kinds=KINDS, **columns)
         for name, errors in (("with", first), ("without", second))
     }
-    return hold_falsifiers([CONTRAST], tables, draws=400)
+    return evaluate_falsifiers([CONTRAST], tables, draws=400)
 
 
 def test_a_gain_under_stress_alone_is_none_without_it():
@@ -74,9 +74,9 @@ def test_few_places_decide_nothing():
 
 def test_a_contrast_by_risk_has_none_and_an_unknown_arm_is_refused():
     risk = Contrast(name="rejection", first="a x b", second="a x c", suites=("alias",), metric="aurc")
-    assert hold_falsifiers([risk], {}) == ()
+    assert evaluate_falsifiers([risk], {}) == ()
     with pytest.raises(ConfigError, match="names 'with', which is not on the board"):
-        hold_falsifiers([CONTRAST], {})
+        evaluate_falsifiers([CONTRAST], {})
 
 
 def test_both_tables_have_a_row_for_each():

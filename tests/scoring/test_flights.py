@@ -13,7 +13,7 @@ from sasgeo_bench.boards.text import warnings_of
 from sasgeo_bench.core.errors import ConfigError, MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
-from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts, hold_contrasts
+from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts, evaluate_contrasts
 from sasgeo_bench.scoring.flights import FLIGHT_COLUMNS, score_flights
 from sasgeo_bench.scoring.metrics import means_of, primary_of, quantiles_of
 from sasgeo_bench.scoring.score import COLUMNS, MISSING
@@ -335,7 +335,7 @@ def test_a_contrast_by_false_fixes_is_won_by_the_side_with_fewer():
     fields = {"first": "careful", "second": "rash", "suites": ("flight-clean",), "track": "sequence"}
     contrast = Contrast(name="none", metric="false_accepted", **fields)
     sides = {"careful": side([1, 1, 0, 1, 0, 1, 1, 0, 1, 1]), "rash": side([4, 3, 4, 5, 5, 4, 3, 4, 4, 5])}
-    (found,) = hold_contrasts([contrast], sides, {}, draws=200)
+    (found,) = evaluate_contrasts([contrast], sides, {}, draws=200)
     assert (found.first_value, found.second_value, found.best) == pytest.approx((0.14, 0.82, 0.0))
     assert (found.winner, found.is_lower_better, found.outcome) == ("careful", True, "decided")
     assert (found.first_only, found.second_only) == (3, 0)  # flights without a false fix

@@ -60,7 +60,7 @@ def test_figures_are_those_of_scikit_learn_where_all_is_said():
     assert scoring.iou(table) == pytest.approx(jaccard_score(truth, seen))
     assert scoring.recall(table) == pytest.approx(recall_score(truth, seen))
     assert scoring.precision(table) == pytest.approx(precision_score(truth, seen))
-    assert scoring.error_said(table) == pytest.approx((seen != truth).mean())
+    assert scoring.error_where_known(table) == pytest.approx((seen != truth).mean())
     assert scoring.share_gap(table) == pytest.approx(chances.mean() - truth.mean())
 
 
@@ -70,7 +70,7 @@ def test_silence_costs_recall_and_is_forgiven_where_only_what_is_said_counts():
     found = {metric.name: float(metric.compute(table)) for metric in scoring.PIXEL_METRICS}
     assert found["recall"] == pytest.approx(2 / 3)
     assert found["iou"] == pytest.approx(2 / 3)
-    assert found["recall_said"] == found["auc"] == found["precision"] == 1
+    assert found["recall_where_known"] == found["auc"] == found["precision"] == 1
     assert found["silent"] == pytest.approx(0.4)
     assert found["error"] == found["brier"] == found["ece"] == 0
     assert np.isnan(found["error_80"])  # only 60 % is said
@@ -79,8 +79,8 @@ def test_silence_costs_recall_and_is_forgiven_where_only_what_is_said_counts():
 def test_to_make_the_least_sure_fifth_unknown_takes_its_errors_away():
     labels = [[[1] * 8 + [1, 0]]]
     table = PixelCounts.of(labelled(labels), said([[[250] * 8 + [120, 130]]]), image="1").of_class("building")
-    assert scoring.error_said(table.astype(float)) == pytest.approx(0.2)
-    assert scoring.error_kept(table.astype(float)) == 0
+    assert scoring.error_where_known(table.astype(float)) == pytest.approx(0.2)
+    assert scoring.error_of_most_confident(table.astype(float)) == 0
 
 
 def test_what_nobody_has_labelled_counts_nowhere():
@@ -170,7 +170,7 @@ def test_tables_of_reliability_and_coverage_add_up():
     assert curve["confidence"].between(0.5, 1.0).all()
     last = curve.iloc[-1]
     assert last["coverage"] == pytest.approx(1)
-    assert last["error"] == pytest.approx(float(scoring.error_said(pooled)))
+    assert last["error"] == pytest.approx(float(scoring.error_where_known(pooled)))
 
 
 def test_counts_come_back_from_their_file(tmp_path):

@@ -15,7 +15,7 @@ from sasgeo_bench.boards.text import MARKDOWN, Contents, board_latex, board_mark
 from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.core.texts import markdown
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
-from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.scoring.contrasts import Contrast, evaluate_contrasts
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.intervals import wilson
@@ -239,7 +239,7 @@ def test_as_few_blocks_as_decide_no_contrast_rank_nobody(blocks, expected):
     assert {ranks(row) for row in rows} == expected
     assert [math.isnan(row["detectable"]) for row in rows] == [blocks < LEAST_BLOCKS] * 2
     contrast = Contrast(name="both", first="good", second="bad", suites=("occlusion",))
-    (found,) = hold_contrasts([contrast], both, {}, draws=200)
+    (found,) = evaluate_contrasts([contrast], both, {}, draws=200)
     assert found.verdict.startswith("not decided") == (blocks < LEAST_BLOCKS)
 
 
@@ -414,7 +414,7 @@ def test_of_candidates_a_board_says_what_guessing_is_worth():
 def test_a_paper_gets_contrasts_controls_labels_and_where_data_are_from():
     tables = {"mine": scores([1.0, 99.0] * 4), "other": scores([99.0] * 8)}
     contrast = Contrast(name="first_one", first="mine", second="other", suites=("occlusion",))
-    findings = hold_contrasts([contrast], tables, {}, draws=200)
+    findings = evaluate_contrasts([contrast], tables, {}, draws=200)
     verdict = Verdict(control="twins", matcher="mine", n=4, found=2.0, expected=2.0, p=math.nan, holds=True)
     latex = board_latex(
         ABOUT, Contents(leaderboard=leaderboard(tables, draws=200), findings=findings, verdicts=[verdict])

@@ -15,7 +15,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.submission_files import validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 POSE = Pose(easting_m=299_878.0, northing_m=5_458_887.0, yaw_deg=3.0)  # amid town-riverside
 
@@ -23,7 +23,9 @@ POSE = Pose(easting_m=299_878.0, northing_m=5_458_887.0, yaw_deg=3.0)  # amid to
 @pytest.fixture(scope="module")
 def task(tmp_path_factory):
     out = tmp_path_factory.mktemp("validate")
-    wanted = Wanted(suites=("false-unknown",), regions=("town-riverside",), split="crossfit", count=1, seed=3, out=out)
+    wanted = TaskRequest(
+        suites=("false-unknown",), regions=("town-riverside",), split="crossfit", count=1, seed=3, out=out
+    )
     return make_tasks(plan_requests(wanted)[0])[0].folder
 
 

@@ -120,7 +120,7 @@ def test_a_window_follows_the_belief_and_its_cells_its_size():
     logs = np.full((len(wide.asked), *wide.shape), -40.0, dtype=np.float32)
     at = wide.grid.to_cells(np.array([(START.easting_m, START.northing_m)]))[0]
     logs[(0, *at)] = 0.0
-    narrow = wide.weighed(logs, doubt=0.0).fitted()
+    narrow = wide.weighed(logs, outlier_probability=0.0).fitted()
     assert narrow.grid.cell_size_m == 4.0
     assert np.hypot(*(np.array(narrow.grid.bounds_m[:2]) - (1800.0, 8300.0))) < 100.0
     assert narrow.mass.sum() == pytest.approx(1.0, abs=1e-4)
@@ -141,7 +141,7 @@ def test_a_view_that_lies_costs_the_truth_no_more_than_the_doubt():
     logs = np.full((len(belief.asked), *belief.shape), -1000.0, dtype=np.float32)
     at = belief.grid.to_cells(np.array([(1900.0, 8300.0)]))[0]
     logs[(slice(None), *at)] = 0.0
-    found = belief.weighed(logs, doubt=0.01)
+    found = belief.weighed(logs, outlier_probability=0.01)
     assert sorted(found.mass[found.mass > 1e-6].tolist()) == pytest.approx([0.01 / 1.01, 1 / 1.01], rel=1e-3)
 
 

@@ -31,7 +31,7 @@ from sasgeo_bench.tasks.task_files import (
     read_truths,
     write_task,
 )
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.tasks.test_task_files import ABOUT, one_query, one_truth
 
 TOWN = "town-grid"
@@ -73,7 +73,7 @@ def short(monkeypatch) -> None:
 
 def make(out: Path, suite: str = "flight-overconfident", **changes):
     base = {"suites": (suite,), "regions": (TOWN,), "split": "crossfit", "count": 1, "seed": 0, "out": out}
-    return [made for request in plan_requests(Wanted(**base | changes)) for made in build.make_tasks(request)]
+    return [made for request in plan_requests(TaskRequest(**base | changes)) for made in build.make_tasks(request)]
 
 
 def paths(flights):

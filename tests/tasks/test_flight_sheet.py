@@ -23,7 +23,7 @@ from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import SEQUENCE_DIGITS, flight_id
 from sasgeo_bench.tasks.sheet import flight_panels, write_flight_sheet
 from sasgeo_bench.tasks.task_files import Task, read_queries
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 NAME = "flight-kidnap/town-grid"
 
@@ -32,7 +32,7 @@ NAME = "flight-kidnap/town-grid"
 def made(towns, tmp_path_factory) -> Path:
     """A root with short flights of two sites; read it, do not write to it."""
     out = Path(shutil.copytree(towns, tmp_path_factory.mktemp("flights") / "out"))
-    wanted = Wanted(suites=("flight-kidnap",), regions=("town-grid",), split="crossfit", count=2, seed=0, out=out)
+    wanted = TaskRequest(suites=("flight-kidnap",), regions=("town-grid",), split="crossfit", count=2, seed=0, out=out)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
         for request in plan_requests(wanted):

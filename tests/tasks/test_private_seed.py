@@ -12,14 +12,14 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, make_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record, take_seed
 from sasgeo_bench.tasks.suites.base import Seeds
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 TEXT = "0f1e2d3c4b5a69788796a5b4c3d2e1f0"
 SEED = PrivateSeed(TEXT)
 
 
 def request_of(out, seed, suite="clean"):
-    wanted = Wanted(suites=(suite,), regions=("town-riverside",), split="crossfit", count=1, seed=seed, out=out)
+    wanted = TaskRequest(suites=(suite,), regions=("town-riverside",), split="crossfit", count=1, seed=seed, out=out)
     return plan_requests(wanted)[0]
 
 

@@ -11,14 +11,14 @@ from sasgeo_bench.tasks.build import carry_out
 from sasgeo_bench.tasks.query import CONTROLS
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Variant
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 TOWNS = ("town-suburb", "town-agricultural")
 
 
 def wanted(out, *suites, regions=TOWNS, **changes):
     return plan_requests(
-        Wanted(
+        TaskRequest(
             suites=suites, regions=regions, split="crossfit", count=1, seed=3, out=out, may_be_fewer=True, **changes
         ),
     )

@@ -14,7 +14,7 @@ from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.suites.ages import AGES_YEARS, DAYS_PER_YEAR
-from sasgeo_bench.tasks.task_plan import Wanted, aged_dates, check_count, check_roots, plan_requests, wrong_place
+from sasgeo_bench.tasks.task_plan import TaskRequest, aged_dates, check_count, check_roots, plan_requests, wrong_place
 
 RIVERSIDE = "town-riverside"
 
@@ -33,7 +33,7 @@ def known():
 
 def plan(tmp_path, **changes):
     base = {"suites": ("clean",), "regions": (RIVERSIDE,), "split": "crossfit", "count": 2, "seed": 0}
-    return plan_requests(Wanted(**base | {"out": tmp_path / "out"} | changes))
+    return plan_requests(TaskRequest(**base | {"out": tmp_path / "out"} | changes))
 
 
 def own_region(folder: Path, *, name: str = "mine", source: str = RIVERSIDE, **changes: str) -> Path:

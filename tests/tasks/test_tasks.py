@@ -35,7 +35,7 @@ from sasgeo_bench.tasks.task_files import (
     read_task,
     read_truths,
 )
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 RIVERSIDE = "town-riverside"
 # The program, ended when all is written and nothing is in its place yet.
@@ -55,7 +55,7 @@ main()
 
 def make(out: Path, suite: str = "absent", **changes):
     base = {"suites": (suite,), "regions": (RIVERSIDE,), "split": "crossfit", "count": 1, "seed": 0, "out": out}
-    wanted = Wanted(**base | changes)
+    wanted = TaskRequest(**base | changes)
     return [made for request in plan_requests(wanted) for made in make_tasks(request)]
 
 

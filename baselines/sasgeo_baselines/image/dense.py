@@ -185,7 +185,7 @@ class Search:
 
     def _at_places(self, spectrum: Spectra) -> Planes:
         rows, cols = self.place.shape
-        along = fft.ifft(spectrum, axis=0)[:rows]  # the other rows are asked about by nobody
+        along = fft.ifft(spectrum, axis=0)[:rows]  # the other rows are not asked for
         return np.asarray(fft.irfft(along, self.shape[1], axis=1)[:, :cols], dtype=np.float32)
 
     def field(self, turns: Sequence[sgb.Pose], views: Iterable[Stack]) -> Field:

@@ -19,7 +19,7 @@ class GridFilter(ABC):
 
     card: ClassVar[sgb.MatcherCard]
     diffuses: ClassVar[bool] = True  # by the covariance of the increments
-    doubt: ClassVar[float]  # share of views that say nothing
+    outlier_probability: ClassVar[float]  # share of views that say nothing
 
     def __init__(self) -> None:
         self._grid: sgb.Grid | None = None
@@ -56,6 +56,6 @@ class GridFilter(ABC):
             raise RuntimeError(f"{self.card.name}: step() needs the views of a flight")
         belief = sgb.followed(self.belief, query.step, diffuses=self.diffuses)
         if not sgb.is_blind(query):
-            belief = belief.weighed(self.logs(query, belief), doubt=self.doubt)
+            belief = belief.weighed(self.logs(query, belief), outlier_probability=self.outlier_probability)
         self._belief = belief.fitted()
         return sgb.fix_of(self._belief, least=LEAST)

@@ -46,8 +46,8 @@ class GridMarkov(GridFilter):
         limits=LIMITS,
         trained_on=TRAINED_ON,
     )
-    temper = TEMPER
-    doubt = DOUBT
+    exponent_scale = TEMPER
+    outlier_probability = DOUBT
 
     def read(self, region: sgb.Region, learned: str | None) -> sgb.Grid:
         """Read a map by hand-set rates."""
@@ -63,7 +63,7 @@ class GridMarkov(GridFilter):
         OrienterNet knows neither the date of a map nor the season, so both are those of the view.
         """
         template = sgb.view_by_hand(replace(query, season=""), self._classes, map_date=query.observed_on)
-        return sgb.surface_logs(self._field, template, belief, temper=self.temper)
+        return sgb.surface_logs(self._field, template, belief, exponent_scale=self.exponent_scale)
 
 
 class GridMarkovStill(GridMarkov):

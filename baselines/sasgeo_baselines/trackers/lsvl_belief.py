@@ -264,8 +264,8 @@ class LsvlBelief(GridFilter):
             "was carried where the belief does not reach; ages of maps are not known to it"
         ),
     )
-    temper = TEMPER
-    doubt = DOUBT
+    exponent_scale = TEMPER
+    outlier_probability = DOUBT
 
     def learn(self, training: sgb.Training) -> str:
         """Fit the ratio to views of training places; without enough of them, return the one that ships."""
@@ -292,7 +292,7 @@ class LsvlBelief(GridFilter):
         compared = self._described.compared(view, cells)
         found = np.empty((len(belief.asked), *belief.shape), dtype=np.float32)
         for into, yaw_deg in zip(found, belief.yaws_deg[belief.asked].tolist(), strict=True):
-            logs = np.float32(self.temper) * self._ratio.at(compared.distances(yaw_deg))
+            logs = np.float32(self.exponent_scale) * self._ratio.at(compared.distances(yaw_deg))
             into[:] = sgb.pooled_logs(logs[None], belief.factor)[0]
         return found
 

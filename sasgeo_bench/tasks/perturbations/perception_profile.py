@@ -30,7 +30,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class ClassConfusions(Document):
-    """Rates of one class, of pixels of which something is said.
+    """Rates of one class, of pixels with a prediction.
 
     `recall` and `precision` as usual; `of_ground` is the fraction of the ground without any labelled class that is seen
     as this one; `called` are fractions of this class that are seen as others instead, `also` those that are seen as

@@ -16,15 +16,15 @@ from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import (
-    Draft,
     Edit,
+    QueryDraft,
     Scene,
     Seeds,
-    Shot,
     Site,
     Suite,
     SuiteCard,
     Variant,
+    ViewRequest,
     controls,
     ladder,
     pair,
@@ -60,12 +60,12 @@ class RealAgeSuite(Suite):
         """Return the older map for a stress, today's for its control."""
         return map_of_age(scene, variant.strength).region if variant.role == "stress" else scene.map.region
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive today's world; measure the age of the map and its changes."""
         if shot.variant.role != "stress":
-            return Draft(evidence=shot.perceived(), changed_share=0.0, measured={"age_years": 0.0})
+            return QueryDraft(evidence=shot.perceived(), changed_share=0.0, measured={"age_years": 0.0})
         old = map_of_age(shot.scene, shot.variant.strength)
-        draft = Draft.of_change(shot.perceived(), shot.clean(), shot.clean(old))
+        draft = QueryDraft.of_change(shot.perceived(), shot.clean(), shot.clean(old))
         return replace(draft, measured={"age_years": age_years(old, shot.scene.world), **draft.measured})
 
 
@@ -120,15 +120,15 @@ class GrowthSuite(Suite):
         """Return the buildings."""
         return places_of(nodes_of(scene, ("building", "building_cluster")))
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Add buildings, then perceive; a control sees the place as mapped."""
         if shot.variant.strength == 0:
-            return Draft(evidence=shot.perceived(error_factor=ERROR_FACTOR), changed_share=0.0)
+            return QueryDraft(evidence=shot.perceived(error_factor=ERROR_FACTOR), changed_share=0.0)
         clean = shot.clean()
         grown = growth(shot.variant.strength)(clean, shot.rng("growth"))
         seen = shot.perceived(grown, error_factor=ERROR_FACTOR)
         old, new = (int((item.layer("building") == PRESENT).sum()) for item in (clean, grown))
-        return Draft.of_change(seen, clean, grown, new_per_old_area=(new - old) / old if old else 0.0)
+        return QueryDraft.of_change(seen, clean, grown, new_per_old_area=(new - old) / old if old else 0.0)
 
 
 def growth(new_per_old: float) -> Ageing:
@@ -168,13 +168,13 @@ class SyntheticAgeSuite(Suite):
         """Refuse a region without rates of other places."""
         return "no rates of ageing from another place" if scene.ageing is None else super().lack(scene)
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Let the years pass, then perceive; a control sees the map's own day."""
         if shot.variant.strength == 0 or shot.scene.ageing is None:
-            return Draft(evidence=shot.perceived(), changed_share=0.0)
+            return QueryDraft(evidence=shot.perceived(), changed_share=0.0)
         clean = shot.clean()
         grown = after(shot.scene.ageing, shot.variant.strength)(clean, shot.rng("ageing"))
-        return Draft.of_change(shot.perceived(grown), clean, grown)
+        return QueryDraft.of_change(shot.perceived(grown), clean, grown)
 
 
 def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
@@ -291,12 +291,12 @@ class VolatileLure(TwinSuite):
             world.append(replace(item, target_m=target_m, change=change))
         return replace(plain, map_pastes=tuple(lures), world_pastes=tuple(world))
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive the changed world for the stress, and the map for control and falsifier."""
         mapped = shot.clean(shot.scene.map)
         if shot.variant.role != "stress":
-            return Draft(evidence=shot.perceived(mapped), changed_share=0.0)
-        return Draft.of_change(shot.perceived(), shot.clean(), mapped)
+            return QueryDraft(evidence=shot.perceived(mapped), changed_share=0.0)
+        return QueryDraft.of_change(shot.perceived(), shot.clean(), mapped)
 
 
 VOLATILE_LURE: Final = VolatileLure(

@@ -165,7 +165,7 @@ class Site:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Draft:
+class QueryDraft:
     """A query drawn by a suite, before ids, priors and candidates are added.
 
     `vectors` are in the view's frame. `pose` is where the view was taken, if that is not the site; `has_pose` is False
@@ -194,7 +194,7 @@ class Draft:
     labels: tuple[FrameLabels, ...] = ()
 
     @classmethod
-    def of_change(cls, evidence: Evidence, before: Evidence, after: Evidence, **measured: float) -> "Draft":
+    def of_change(cls, evidence: Evidence, before: Evidence, after: Evidence, **measured: float) -> "QueryDraft":
         """Return a draft that records the changed share between two perfect views."""
         share = changed_share(before, after)
         return cls(evidence=evidence, changed_share=share, measured={"changed_share": share, **measured})
@@ -311,7 +311,7 @@ class Suite(ABC):
         return None
 
     @abstractmethod
-    def draw(self, shot: "Shot") -> Draft:
+    def draw(self, shot: "ViewRequest") -> QueryDraft:
         """Draw the evidence and truth of one query."""
 
 
@@ -341,7 +341,7 @@ class Seeds:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shot:
+class ViewRequest:
     """One view to draw: a variant at a site of a scene, and the seeds of the site.
 
     For a view of a flight `seeds` are those of the view, and `flight_seeds` those of what lasts for the whole flight.
@@ -448,10 +448,10 @@ class PlainSuite(Suite):
 
     change: Callable[[Variant, Evidence, np.random.Generator], Evidence]
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive, then change unless it is a control."""
         before = shot.perceived()
         if shot.variant.role == "control":
-            return Draft(evidence=before)
+            return QueryDraft(evidence=before)
         after = self.change(shot.variant, before, shot.rng("change", shot.variant.kind))
-        return Draft(evidence=after, measured={"unknown_added": after.unknown_share - before.unknown_share})
+        return QueryDraft(evidence=after, measured={"unknown_added": after.unknown_share - before.unknown_share})

@@ -12,7 +12,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence, LayerBits
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup, Track
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.base import Draft, Shot, SuiteCard, Variant, changed_share
+from sasgeo_bench.tasks.suites.base import QueryDraft, SuiteCard, Variant, ViewRequest, changed_share
 from sasgeo_bench.tasks.suites.twins import TwinSuite
 
 VIEW_CELLS: Final = 96
@@ -32,22 +32,22 @@ class ControlSuite(TwinSuite):
         """Ask for twins only among candidates."""
         return ("retrieval",) if variant.kind == TWINS else self.card.tracks
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """See the map of the variant's kind; only `TWINS` has the site's twin among its candidates."""
         clear, kind = shot.clean(), shot.variant.kind
         if kind == BLIND:
             nothing = clear.replace(np.full_like(clear.cells, UNKNOWN))
-            return Draft(evidence=nothing, is_present=False, has_pose=False, is_removed=True, has_twins=False)
+            return QueryDraft(evidence=nothing, is_present=False, has_pose=False, is_removed=True, has_twins=False)
         if kind == SHUFFLED:
             return _wrong(shot.clean(shuffled(shot.scene.world, shot.seeds.rng(SHUFFLED))), clear)
         if kind == TURNED:
             return _wrong(shot.variant.view(shot.scene.world, _turned(shot)), clear)
         is_twin = kind == TWINS
-        return Draft(evidence=clear, has_twins=is_twin, group=None if is_twin else NEAR)
+        return QueryDraft(evidence=clear, has_twins=is_twin, group=None if is_twin else NEAR)
 
 
-def _wrong(seen: Evidence, clear: Evidence) -> Draft:
-    return Draft(evidence=seen, has_twins=False, changed_share=changed_share(clear, seen))
+def _wrong(seen: Evidence, clear: Evidence) -> QueryDraft:
+    return QueryDraft(evidence=seen, has_twins=False, changed_share=changed_share(clear, seen))
 
 
 def shuffled(state: State, rng: np.random.Generator) -> State:
@@ -63,7 +63,7 @@ def shuffled(state: State, rng: np.random.Generator) -> State:
     return replace(state, bits=LayerBits(bits=bits, count=state.bits.count))
 
 
-def _turned(shot: Shot) -> Pose:
+def _turned(shot: ViewRequest) -> Pose:
     """Return where the view comes from if the world is rotated by 180 degrees: a mapped place well away."""
     scene, here, rng = shot.scene, np.array(shot.site.en_m), shot.seeds.rng(TURNED)
     least_m = 2 * scene.view_reach_m

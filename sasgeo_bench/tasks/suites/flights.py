@@ -18,7 +18,7 @@ from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.sensing.rendering.seasons import Season
 from sasgeo_bench.tasks.query import RADII_M, PriorGroup, Track
 from sasgeo_bench.tasks.suites.ages import AGES_YEARS, age_years, has_age, map_of_age
-from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.base import QueryDraft, Scene, Suite, SuiteCard, Variant, ViewRequest
 from sasgeo_bench.tasks.suites.pictures import Flight, PictureSuite
 from sasgeo_bench.tasks.suites.twins import RIVAL_M
 from sasgeo_bench.tasks.twin import Paste, mirror, paste, without
@@ -90,9 +90,9 @@ class FlightSuite(Suite):
     every_m: tuple[float, float] = SPACING_M
     longest_m: float = max(LENGTHS_M)
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive one view."""
-        return Draft(evidence=shot.perceived())
+        return QueryDraft(evidence=shot.perceived())
 
     def map_of(self, scene: Scene, variant: Variant, site: int) -> str:  # noqa: ARG002 - all sites are alike
         """Return the name of the map that a variant searches at a site, given by its index."""
@@ -282,9 +282,9 @@ def _hole(
     found: list[tuple[float, shapely.Polygon]] = []
     for _ in range(40 if len(middles) else 0):  # tried for each length
         # 0.6 of its radius, by which the middle of the hole may lie off the path
-        middle, turn, aside = place_m[rng.choice(middles)], rng.uniform(0, 2 * np.pi), 0.6 * rng.random()
+        middle, turn, off_share = place_m[rng.choice(middles)], rng.uniform(0, 2 * np.pi), 0.6 * rng.random()
         for radius_m in stretch_m * _RADII:
-            center_m = middle + aside * radius_m * np.array([np.sin(turn), np.cos(turn)])
+            center_m = middle + off_share * radius_m * np.array([np.sin(turn), np.cos(turn)])
             off_m = np.hypot(*(place_m - center_m).T)
             inside = off_m < radius_m
             # How much is flown inside: in the longest run of views, and in all together
@@ -405,8 +405,8 @@ def _room(
     is_within = ((shifts_m >= room_m[:2]) & (shifts_m <= room_m[2:])).all(axis=1)
     for shift_m in shifts_m[is_near & is_within].tolist():
         copy = shapely.affinity.translate(area, *shift_m)
-        is_apart = not copy.intersects(area)
-        if is_apart and ground.mapped.contains(copy) and ground.is_free(copy, place_m):
+        is_clear = not copy.intersects(area)
+        if is_clear and ground.mapped.contains(copy) and ground.is_free(copy, place_m):
             return (shift_m[0], shift_m[1])
     return None
 
@@ -564,7 +564,7 @@ class FlightKidnapSuite(FlightSuite):
     """A flight that begins elsewhere; from the middle on it is the control's."""
 
     def lack(self, scene: Scene) -> str | None:
-        """Refuse a map on which nobody can be carried even the least distance."""
+        """Refuse a map on which no drone can be carried even the least distance."""
         if not carries(scene, min(DISTANCES_M)):
             return f"no room to be carried {min(DISTANCES_M):g} m"
         return super().lack(scene)
@@ -648,12 +648,12 @@ class FlightRealAgeSuite(FlightSuite):
         """Return the older map for a stress, today's for the others."""
         return map_of_age(scene, variant.strength).region if variant.role == "stress" else scene.map.region
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive today's world; measure the age of the map and its changes."""
         if shot.variant.role != "stress":
             return replace(super().draw(shot), changed_share=0.0, measured={"age_years": 0.0})
         old = map_of_age(shot.scene, shot.variant.strength)
-        draft = Draft.of_change(shot.perceived(), shot.clean(), shot.clean(old))
+        draft = QueryDraft.of_change(shot.perceived(), shot.clean(), shot.clean(old))
         return replace(draft, measured={"age_years": age_years(old, shot.scene.world), **draft.measured})
 
 

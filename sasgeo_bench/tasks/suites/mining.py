@@ -243,8 +243,8 @@ def _in_turn(
     """Yield the best of each scorer in turn, then the second best, and so on; skip places near a taken one."""
     places = np.rint((points_m - points_m.min(axis=0)) / STRIDE_M).astype(np.int64)
     reach = int(np.ceil(spacing_m / STRIDE_M))
-    aside = np.arange(-reach, reach + 1) * STRIDE_M
-    disc = np.hypot(aside[:, None], aside[None, :]) < spacing_m
+    offsets_m = np.arange(-reach, reach + 1) * STRIDE_M
+    disc = np.hypot(offsets_m[:, None], offsets_m[None, :]) < spacing_m
     # One cell for each place of the lattice, with a margin as wide as the disc, so that it need not be clipped.
     is_taken = np.zeros(places.max(axis=0) + 1 + 2 * reach, dtype=bool)
     flat = np.ravel_multi_index(tuple((places + reach).T), is_taken.shape)

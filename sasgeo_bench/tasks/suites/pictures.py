@@ -26,7 +26,7 @@ from sasgeo_bench.tasks.frame_evidence import poses_before
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import PAINTED, PERCEIVED, REAL, Detector, Role
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.base import MAIN_VIEW_CELLS, Draft, Scene, Shot, Suite, SuiteCard, Variant
+from sasgeo_bench.tasks.suites.base import MAIN_VIEW_CELLS, QueryDraft, Scene, Suite, SuiteCard, Variant, ViewRequest
 
 if TYPE_CHECKING:
     from sasgeo_bench.sensing.rendering.palettes import Family
@@ -78,7 +78,7 @@ class Flight:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stand:
+class CameraBelief:
     """One camera: as it was, in the CRS of the map, and as it is believed to have been, in the frame of the view."""
 
     true: Camera
@@ -107,25 +107,25 @@ class PictureSuite(Suite):
         """Return the families of looks, and models of perception of the same views, which hold no pictures."""
         return (*PAINTED, *PERCEIVED)
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Take the pictures of a shot; their evidence is unknown until a segmenter has seen them.
 
         A model of perception takes none: it is what the same view would be worth without camera and segmenter.
         """
         if shot.variant.detector in PERCEIVED:
-            return Draft(evidence=shot.perceived())
+            return QueryDraft(evidence=shot.perceived())
         variant, flight = shot.variant, self.flight(shot.variant)
         of_weather = (shot.flight_seeds or shot.seeds).rng("conditions")
         conditions = flight.conditions(draw_conditions(of_weather, season="summer"))
         painted = _painted(shot, flight)
-        stands = stands_of(shot, flight)
+        stands = camera_beliefs(shot, flight)
         rng = shot.rng("sensor", variant.name)
         pictures = [render(painted, stand.true, conditions, rng) for stand in stands]
         found = [labels(painted, stand.true, season=conditions.season) for stand in stands]
         state = shot.scene.world
         is_there = "building" in state.classes
         share = float((found[-1][state.classes.index("building")] == 1).mean()) if is_there else 0.0
-        return Draft(
+        return QueryDraft(
             evidence=_unseen(state.classes, variant.view_cells, variant.cell_size_m),
             frames=tuple(
                 Frame(
@@ -161,21 +161,21 @@ def _unseen(classes: tuple[str, ...], size_cells: int, cell_size_m: float) -> Ev
 _MOST_TILT_DEG: Final = 60.0  # of optical axes: the middle of a view must be seen
 
 
-def stands_of(shot: Shot, flight: Flight) -> list[Stand]:
+def camera_beliefs(shot: ViewRequest, flight: Flight) -> list[CameraBelief]:
     """Return where the cameras of a shot stood, and where they are believed to have stood, oldest first."""
     flown = [Pose(easting_m=right_m, northing_m=ahead_m, yaw_deg=0.0) for right_m, ahead_m in flight.stops_m]
-    said = poses_before(believed_steps(steps_between(flown), flight.odometry, shot.seeds.rng("odometry")))
+    believed = poses_before(believed_steps(steps_between(flown), flight.odometry, shot.seeds.rng("odometry")))
     # The newest frame's are drawn alike in all variants.
     angles_deg = shot.seeds.rng("attitude").standard_normal((len(STOPS_M), 4))[len(STOPS_M) - len(flown) :]
     found = []
-    for stop, place, drawn in zip(flown, said, angles_deg, strict=True):
+    for stop, place, drawn in zip(flown, believed, angles_deg, strict=True):
         body = BODY_SIGMA_DEG * drawn[:2] if flight.is_fixed else np.zeros(2)
         # 60 degrees of tilt of optical axes: the middle of a view must be seen
         tilt_deg, roll_deg = min(flight.tilt_deg + float(body[0]), _MOST_TILT_DEG), float(body[1])
         off = (ATTITUDE_SIGMA_DEG * drawn[2:]).tolist()
         distance_m = math.hypot(stop.easting_m, stop.northing_m)
         found.append(
-            Stand(
+            CameraBelief(
                 true=_camera(flight, shot.site.pose, stop, tilt_deg + off[0], roll_deg + off[1]),
                 believed=_camera(flight, _VIEW, place, tilt_deg, roll_deg),
                 position_sigma_m=round(flight.odometry.position_share * distance_m, 3),
@@ -200,7 +200,7 @@ def _camera(flight: Flight, view: Pose, stop: Pose, tilt_deg: float, roll_deg: f
     )
 
 
-def _painted(shot: Shot, flight: Flight) -> Painted:
+def _painted(shot: ViewRequest, flight: Flight) -> Painted:
     """Return the painted window of a shot, from the scene's store if it was painted just before."""
     scene, site, variant = shot.scene, shot.site, shot.variant
     family: Family = "shifted" if variant.detector == "shifted" else scene.looks[site.block]
@@ -234,7 +234,7 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
             family=family,
             relief=flight.relief,
         )
-        # 0.75 of the flight's height: whoever flies there flies above everything
+        # 0.75 of the flight's height: a flight there is above everything
         scene.painted[key] = replace(made, below_m=0.75 * flight.height_m)
     return scene.painted[key]
 
@@ -426,7 +426,7 @@ class RealImageSuite(Suite):
         """Return the degraded map for its variants."""
         return scene.others[0].region if variant.kind == DEGRADED else scene.map.region
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Cut the picture of a shot; its evidence is unknown until a segmenter has seen it."""
         variant, state, imagery = shot.variant, shot.scene.world, shot.scene.imagery
         if imagery is None:
@@ -446,7 +446,7 @@ class RealImageSuite(Suite):
             camera=_real_camera(pixel_m, width_px),
             height_sigma_m=round(_REAL_HEIGHT_M * self.card.group.scale_sigma, 2),
         )
-        return Draft(
+        return QueryDraft(
             evidence=Evidence(classes=state.classes, cells=cells, cell_size_m=variant.cell_size_m),
             frames=(frame,),
             labels=(FrameLabels.of(state.classes, found),),
@@ -471,7 +471,7 @@ def _labels(state: State, ground_m: NDArray[np.float64], is_known: NDArray[np.bo
     return found
 
 
-def _pose(shot: Shot) -> Pose:
+def _pose(shot: ViewRequest) -> Pose:
     """Return where the picture of a shot is taken: the falsifier's is turned by a quarter to three quarters."""
     site = shot.site.pose
     if shot.variant.kind != _TURNED:

@@ -18,7 +18,18 @@ from sasgeo_bench.regions.graph import LAYERS
 from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.query import CEILING, RADII_M, PriorGroup
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, SuiteCard, Variant, pair
+from sasgeo_bench.tasks.suites.base import (
+    Edit,
+    QueryDraft,
+    Scene,
+    Seeds,
+    Site,
+    Suite,
+    SuiteCard,
+    Variant,
+    ViewRequest,
+    pair,
+)
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import ANCHOR_SPREAD
 from sasgeo_bench.tasks.suites.vectors import site_vectors
@@ -100,7 +111,7 @@ class TwinSuite(Suite):
         """Find places for the twins, plan the copies, and draw the true place of each site."""
         clear_m = self.clear_m(scene)
         spacing_m = max(min_distance_m(self.main_side_m / 2), 2 * clear_m)
-        room = Room(clear_m=clear_m, spacing_m=spacing_m, within_m=self.within_m)
+        room = CopySpacing(clear_m=clear_m, spacing_m=spacing_m, within_m=self.within_m)
         targets = find_targets(scene.map, sites, room, copies=self.copies, seeds=seeds)
         pastes: list[Paste] = []
         moved: list[Site] = []
@@ -129,19 +140,19 @@ class TwinSuite(Suite):
         for target in targets:
             yield replace(plain, target_m=_place(np.array(target) + off_m), change=None if is_changed else change)
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """See the true place; the control has no vectors, the falsifier's do not distinguish the two places."""
         seen, role = self.see(shot), shot.variant.role
         if role == "stress":
-            return Draft(evidence=seen, vectors=site_vectors(shot, shot.site.pose))
+            return QueryDraft(evidence=seen, vectors=site_vectors(shot, shot.site.pose))
         vectors = None if role == "control" else site_vectors(shot, self._uninformative_pose(shot))
-        return Draft(evidence=seen, vectors=vectors, measured={CEILING: 1.0 / (1 + self.copies)})
+        return QueryDraft(evidence=seen, vectors=vectors, measured={CEILING: 1.0 / (1 + self.copies)})
 
-    def see(self, shot: Shot) -> Evidence:
+    def see(self, shot: ViewRequest) -> Evidence:
         """Perceive the layers at the true place."""
         return shot.perceived()
 
-    def _uninformative_pose(self, shot: Shot) -> Pose:
+    def _uninformative_pose(self, shot: ViewRequest) -> Pose:
         """Return where the falsifier's vectors are taken: at the site or at its twin."""
         site = shot.site
         is_changed = (self.is_swapped and site.index % 2 == 1) != site.is_copy
@@ -172,7 +183,7 @@ def _by_lot(scene: Scene, site: Site, targets: Places, seeds: Seeds) -> tuple[Si
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Room:
+class CopySpacing:
     """What the copies of a site need: mapped ground around each, and least and largest distance from their site."""
 
     clear_m: float
@@ -180,7 +191,9 @@ class Room:
     within_m: float = math.inf
 
 
-def find_targets(state: State, sites: Sequence[Site], room: Room, *, copies: int, seeds: Seeds) -> dict[int, Places]:
+def find_targets(
+    state: State, sites: Sequence[Site], room: CopySpacing, *, copies: int, seeds: Seeds
+) -> dict[int, Places]:
     """Find free places for the copies of every site: mapped, clear of every site and copy, neither near nor far.
 
     Sites take turns; one without room for all its copies is dropped. The offset of a copy is a whole number of cells:
@@ -271,7 +284,7 @@ class TopologyTwins(TwinSuite):
     With junctions drawn by lot, as a detector of that resolution would see them, layers cannot.
     """
 
-    def see(self, shot: Shot) -> Evidence:
+    def see(self, shot: ViewRequest) -> Evidence:
         """Perceive the layers with each junction as in one of the two places."""
         easting_m, northing_m = shot.scene.twins[shot.site.index][0]
         twin = replace(shot.site.pose, easting_m=easting_m, northing_m=northing_m)
@@ -322,15 +335,15 @@ COPIES: Final = 3
 class AliasSuite(TwinSuite):
     """R1: the truth is not among the candidates. R2: neighbours 5 m away. R4: identical blocks."""
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive one view; the variant determines the candidates."""
         seen, kind = shot.perceived(), shot.variant.kind
         if kind.startswith("R1"):
-            return Draft(evidence=seen, is_present=False, is_removed=True)
+            return QueryDraft(evidence=seen, is_present=False, is_removed=True)
         if kind.startswith("R2"):
-            return Draft(evidence=seen, has_twins=False, neighbours_m=_neighbours(shot.seeds.rng("neighbours")))
+            return QueryDraft(evidence=seen, has_twins=False, neighbours_m=_neighbours(shot.seeds.rng("neighbours")))
         has_twins = kind.startswith("R4")
-        return Draft(evidence=seen, has_twins=has_twins, measured={"twins": float(COPIES * has_twins)})
+        return QueryDraft(evidence=seen, has_twins=has_twins, measured={"twins": float(COPIES * has_twins)})
 
 
 def _neighbours(rng: np.random.Generator) -> tuple[tuple[float, float], ...]:
@@ -374,7 +387,7 @@ def _overpasses(scene: Scene) -> NDArray[np.float64]:
 class GradeSeparation(TwinSuite):
     """Twins with the bridge layer unknown in every view, so that only the vectors show the difference."""
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Hide the bridge layer."""
         draft = super().draw(shot)
         return replace(draft, evidence=without(draft.evidence, "bridge"))
@@ -426,7 +439,7 @@ def _halls(scene: Scene) -> NDArray[np.float64]:
 class InstanceTwins(TwinSuite):
     """Twins whose falsifier derives the vectors from the mask, which is the same at both places."""
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Give instances as perceived, as derived from the mask, or none."""
         draft = super().draw(shot)
         if shot.variant.role != "falsifier":
@@ -505,12 +518,12 @@ class StableNotDistinctive(Suite):
             map_pastes=(), world_pastes=None, sites=tuple(site for site in sites if twins[site.index]), twins=twins
         )
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Mirror the layers of some volatile classes within the view: all of them at strength 1."""
         seen = shot.perceived()
         # 6 steps of the change: so many however many classes there are
         after = mirrored(seen, round(shot.variant.strength * 6))
-        return Draft(evidence=after, measured={"cells_changed": share_changed(seen, after)})
+        return QueryDraft(evidence=after, measured={"cells_changed": share_changed(seen, after)})
 
 
 def mirrored(evidence: Evidence, count: int) -> Evidence:

@@ -19,7 +19,7 @@ from sasgeo_bench.regions.evidence import footprint
 from sasgeo_bench.tasks.perturbations.streams import Streams
 from sasgeo_bench.tasks.query import PUBLISHED
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.base import Shot
+from sasgeo_bench.tasks.suites.base import ViewRequest
 from sasgeo_bench.tasks.vectors import VECTOR_CLASSES, vector_table
 
 if TYPE_CHECKING:
@@ -305,7 +305,7 @@ def perceive_vectors(
     return vector_table(rows)
 
 
-def site_vectors(shot: Shot, pose: Pose | None = None) -> "gpd.GeoDataFrame":
+def site_vectors(shot: ViewRequest, pose: Pose | None = None) -> "gpd.GeoDataFrame":
     """Perceive the vectors of a shot with its detector, at its site unless another pose is given."""
     world, place, side_m = shot.scene.world, pose or shot.site.pose, shot.variant.side_m
     rng = shot.rng("vectors", *shot.draw)

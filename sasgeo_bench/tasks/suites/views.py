@@ -30,14 +30,14 @@ from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import (
     MAIN_VIEW_CELLS,
-    Draft,
     PlainSuite,
+    QueryDraft,
     Scene,
-    Shot,
     Site,
     Suite,
     SuiteCard,
     Variant,
+    ViewRequest,
     controls,
     ladder,
 )
@@ -60,17 +60,17 @@ class AbsentSuite(Suite):
             return "no other region: name a second one, views of a wrong place are taken there"
         return None
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Draw one kind of absence."""
         kind, elsewhere = shot.variant.kind, shot.scene.elsewhere
         if kind == "outside":
             # The searched disc is so far away that it excludes the footprint of the view.
-            return Draft(evidence=shot.perceived(), is_present=False, away_m=2 * shot.variant.side_m)
+            return QueryDraft(evidence=shot.perceived(), is_present=False, away_m=2 * shot.variant.side_m)
         if kind == "feature-poor":
             return _feature_poor(shot)
         if kind == "wrong place" and elsewhere is not None:
             other = replace(shot, site=_same_place_elsewhere(shot, elsewhere))
-            return Draft(
+            return QueryDraft(
                 evidence=other.perceived(other.clean(elsewhere)),
                 is_present=False,
                 has_pose=False,
@@ -80,21 +80,23 @@ class AbsentSuite(Suite):
         seen = shot.perceived()
         if kind == "corrupted view":
             broken = shuffle_patches(seen, shot.seeds.rng("patches"))
-            return Draft(evidence=broken, is_present=False, measured={"cells_changed": share_changed(seen, broken)})
-        return Draft(evidence=seen)
+            return QueryDraft(
+                evidence=broken, is_present=False, measured={"cells_changed": share_changed(seen, broken)}
+            )
+        return QueryDraft(evidence=seen)
 
 
-def _feature_poor(shot: Shot) -> Draft:
+def _feature_poor(shot: ViewRequest) -> QueryDraft:
     """Draw a place of the same block with hardly any feature, or the site's own view without its features."""
     # The place is on the map, so an answer may be right; but hardly anything distinguishes it.
     poor = _poor_place(shot)
     if poor is None:
-        return Draft(evidence=strip(shot.perceived()), density=0.0, measured={"is_real_place": 0.0})
+        return QueryDraft(evidence=strip(shot.perceived()), density=0.0, measured={"is_real_place": 0.0})
     seen = replace(shot, site=poor).perceived()
-    return Draft(evidence=seen, pose=poor.pose, density=poor.density, measured={"is_real_place": 1.0})
+    return QueryDraft(evidence=seen, pose=poor.pose, density=poor.density, measured={"is_real_place": 1.0})
 
 
-def _poor_place(shot: Shot) -> Site | None:
+def _poor_place(shot: ViewRequest) -> Site | None:
     """Return a place in the site's block whose square is mapped and holds hardly any feature."""
     state, rng = shot.scene.map, shot.seeds.rng("feature-poor")
     west, south, east, north = next(item for item in shot.scene.blocks if item.id == shot.site.block).bounds_m
@@ -139,7 +141,7 @@ def shuffle_patches(evidence: Evidence, rng: np.random.Generator) -> Evidence:
     return evidence.replace(cells)
 
 
-def _same_place_elsewhere(shot: Shot, other: State) -> Site:
+def _same_place_elsewhere(shot: ViewRequest, other: State) -> Site:
     """Return the place of the other region whose density is nearest to the site's, so that it gives nothing away."""
     rng = shot.seeds.rng("elsewhere")
     west, south, east, north = other.grid.bounds_m
@@ -180,11 +182,11 @@ ABSENT: Final = AbsentSuite(
 class CleanSuite(Suite):
     """Perception from half to four times its error in domain; controls and falsifiers have no error."""
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive the world with the error factor of the variant."""
         perfect = shot.clean()
         seen = shot.perceived(perfect, error_factor=shot.variant.strength)
-        return Draft(evidence=seen, measured={"cells_changed": share_changed(perfect, seen)})
+        return QueryDraft(evidence=seen, measured={"cells_changed": share_changed(perfect, seen)})
 
 
 CLEAN: Final = CleanSuite(
@@ -237,15 +239,15 @@ _WARPS: Final[Mapping[str, Callable[[float], Warp]]] = {
 class LocalWarpSuite(Suite):
     """One displacement field of each kind for a site, of growing strength; vectors move with the cells."""
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive, then bend."""
         seen, vectors, kind = shot.perceived(), site_vectors(shot), shot.variant.kind
         if shot.variant.strength == 0:
-            return Draft(evidence=seen, vectors=vectors)
+            return QueryDraft(evidence=seen, vectors=vectors)
         rng = shot.rng("warp") if kind == WAVES else shot.rng("warp", kind)
         field_m = _WARPS[kind](shot.variant.strength).field(seen.shape, seen.cell_size_m, rng)
         after = warped(seen, field_m)
-        return Draft(
+        return QueryDraft(
             evidence=after,
             vectors=bent(vectors, field_m, seen.cell_size_m),
             measured={
@@ -303,10 +305,10 @@ class NoPriorsSuite(Suite):
         area_km2 = float(scene.map.known.sum()) * scene.map.grid.cell_size_m**2 / 1e6
         return None if area_km2 >= LEAST_KM2 else f"{area_km2:.2f} km2 mapped, at least {LEAST_KM2:g} are needed"
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive layers and vectors; the variant determines the priors."""
         group = None if shot.variant.role == "stress" else GIVEN
-        return Draft(evidence=shot.perceived(), vectors=site_vectors(shot), group=group)
+        return QueryDraft(evidence=shot.perceived(), vectors=site_vectors(shot), group=group)
 
 
 NO_PRIORS: Final = NoPriorsSuite(
@@ -413,15 +415,15 @@ class SeasonSuite(Suite):
         }
         return tuple(item for item in self.variants if item.role == "control" or item.kind in able)
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Change the view by the season, then perceive it."""
         if shot.variant.role == "control":
-            return Draft(evidence=shot.perceived())
+            return QueryDraft(evidence=shot.perceived())
         kind = next(kind for kind in get_args(Kind) if kind == shot.variant.kind)
         clean = shot.clean()
         changed = Season(kind=kind, strength=shot.variant.strength)(clean, shot.rng("season", kind))
         measured = {"cells_changed": share_changed(clean, changed)}
-        return Draft(evidence=shot.perceived(changed), season=kind, measured=measured)
+        return QueryDraft(evidence=shot.perceived(changed), season=kind, measured=measured)
 
 
 SEASON: Final = SeasonSuite(
@@ -458,11 +460,11 @@ def budget_bytes(strength: float) -> int:
 class TelemetrySuite(Suite):
     """The same perceived view, sent in several ways."""
 
-    def draw(self, shot: Shot) -> Draft:
+    def draw(self, shot: ViewRequest) -> QueryDraft:
         """Perceive, send, and show what arrives."""
         seen = shot.perceived()
         sent = _sent(shot, seen)
-        return Draft(
+        return QueryDraft(
             evidence=sent.evidence,
             vectors=sent.vectors,
             measured={
@@ -473,7 +475,7 @@ class TelemetrySuite(Suite):
         )
 
 
-def _sent(shot: Shot, seen: Evidence) -> Sent:
+def _sent(shot: ViewRequest, seen: Evidence) -> Sent:
     kind, budget = shot.variant.kind, budget_bytes(shot.variant.strength)
     if kind == OUTLINES:
         return outlines(seen, budget_bytes=budget)

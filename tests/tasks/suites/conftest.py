@@ -24,7 +24,7 @@ from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.split import blocks_of, find_split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, Variant
+from sasgeo_bench.tasks.suites.base import Edit, QueryDraft, Scene, Seeds, Site, Suite, Variant, ViewRequest
 from sasgeo_bench.tasks.suites.flights import ChangedMapSuite, FlightImageSuite, changed, changes_of
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
@@ -74,14 +74,14 @@ class Carried:
     sites: tuple[Site, ...]
     seeds: Seeds
     edit: Edit | None
-    drafts: dict[tuple[int, Variant], Draft] = field(init=False, default_factory=dict)
+    drafts: dict[tuple[int, Variant], QueryDraft] = field(init=False, default_factory=dict)
 
-    def draw(self, site: Site, variant: Variant) -> Draft:
+    def draw(self, site: Site, variant: Variant) -> QueryDraft:
         """One draft, as `draw.Drawer` asks for it."""
         seeds = self.seeds.under("site", site.index)
-        return self.suite.draw(Shot(scene=self.scene, site=site, variant=variant, seeds=seeds))
+        return self.suite.draw(ViewRequest(scene=self.scene, site=site, variant=variant, seeds=seeds))
 
-    def drawn(self, site: Site, variant: Variant) -> Draft:
+    def drawn(self, site: Site, variant: Variant) -> QueryDraft:
         """The same, drawn once for all tests."""
         key = (site.index, variant)
         if key not in self.drafts:

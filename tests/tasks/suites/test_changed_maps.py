@@ -17,7 +17,7 @@ from sasgeo_bench.tasks.suites.all_suites import FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.flights import LOST, OFF_MAP, SHARES, Ground, lengths_within
 from sasgeo_bench.tasks.suites.twins import RIVAL_M
 from sasgeo_bench.tasks.task_files import read_truths
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 CHANGED = ("flight-off-map", "flight-alias")
 TOWN = "town-suburb"
@@ -199,7 +199,7 @@ def test_the_map_of_a_stress_takes_turns_so_that_its_name_does_not_tell(flown):
 def test_changed_maps_are_regions_of_their_own_and_their_tasks_hold_together(own_town, monkeypatch):
     name = "flight-off-map"
     monkeypatch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
-    wanted = Wanted(suites=(name,), regions=(TOWN,), split="crossfit", count=1, seed=0, out=own_town)
+    wanted = TaskRequest(suites=(name,), regions=(TOWN,), split="crossfit", count=1, seed=0, out=own_town)
     (request,) = plan_requests(wanted)
     made = make_tasks(request)
     names = [f"{TOWN}+{name}-1", f"{TOWN}+{name}-2"]
@@ -220,7 +220,7 @@ def test_changed_maps_are_regions_of_their_own_and_their_tasks_hold_together(own
 def test_where_nothing_can_be_changed_the_request_gets_one_line_and_writes_no_map(own_town, monkeypatch):
     monkeypatch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
     monkeypatch.setattr("sasgeo_bench.tasks.suites.flights.STRETCHES_M", ())
-    wanted = Wanted(suites=("flight-off-map",), regions=(TOWN,), split="crossfit", count=1, seed=0, out=own_town)
+    wanted = TaskRequest(suites=("flight-off-map",), regions=(TOWN,), split="crossfit", count=1, seed=0, out=own_town)
     (request,) = plan_requests(wanted)
     with pytest.raises(ConfigError, match="town-suburb has room for 0 of 1 flights of suite 'flight-off-map'"):
         make_tasks(request)

@@ -14,7 +14,7 @@ from sasgeo_bench.tasks.perturbations.perception import Perception
 from sasgeo_bench.tasks.state import DRAWN_CLASSES
 from sasgeo_bench.tasks.suites.ages import after, ageing_of
 from sasgeo_bench.tasks.suites.all_suites import SUITES
-from sasgeo_bench.tasks.suites.base import Shot
+from sasgeo_bench.tasks.suites.base import ViewRequest
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.suites.twins import VOLATILE, straight_places
@@ -93,7 +93,7 @@ def test_the_view_of_a_falsifier_is_that_of_its_control_but_for_the_draw_of_erro
     for variant in stresses(made, "falsifier"):
         draft, control = (made.drawn(made.sites[0], one) for one in (variant, made.control(variant)))
         assert name == "clean" or (draft.evidence.cells != control.evidence.cells).any()
-    monkeypatch.setattr(Shot, "draw", property(lambda shot: shot.variant.others))
+    monkeypatch.setattr(ViewRequest, "draw", property(lambda shot: shot.variant.others))
     for variant in stresses(made, "falsifier"):
         for site in made.sites:
             draft, control = made.draw(site, variant), made.drawn(site, made.control(variant))

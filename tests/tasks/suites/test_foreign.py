@@ -11,7 +11,7 @@ from sasgeo_bench.running.suite_testing import check_suite
 from sasgeo_bench.tasks.build import made_tasks, make_tasks
 from sasgeo_bench.tasks.suites.all_suites import _foreign, find_suite, known_suite, suite_code
 from sasgeo_bench.tasks.task_files import read_task
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 TOWN = "town-agricultural"
 
@@ -37,7 +37,7 @@ def written(tmp_path, monkeypatch):
 
 
 def planned(spec, out):
-    wanted = Wanted(suites=(spec,), regions=(TOWN,), split="crossfit", count=1, seed=1, out=out, may_be_fewer=True)
+    wanted = TaskRequest(suites=(spec,), regions=(TOWN,), split="crossfit", count=1, seed=1, out=out, may_be_fewer=True)
     return plan_requests(wanted)[0]
 
 

@@ -10,7 +10,7 @@ import shapely
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.tasks.query import PUBLISHED
-from sasgeo_bench.tasks.suites.base import Shot
+from sasgeo_bench.tasks.suites.base import ViewRequest
 from sasgeo_bench.tasks.suites.vectors import (
     MeasuredVectorNoise,
     VectorNoise,
@@ -118,7 +118,7 @@ def test_a_site_is_drawn_by_the_detector_of_the_variant_and_alike_each_time(carr
     made = carried("local-warp")
     site, plain = made.sites[0], made.suite.variants[0]
     shots = [
-        Shot(
+        ViewRequest(
             scene=made.scene,
             site=site,
             variant=replace(plain, detector=detector),

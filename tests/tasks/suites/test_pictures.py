@@ -13,8 +13,8 @@ from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.suites import pictures
 from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES, SUITES, find_suite
-from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Seeds, Shot, Site, Variant
-from sasgeo_bench.tasks.suites.pictures import STOPS_M, Flight, PictureSuite, stands_of
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Seeds, Site, Variant, ViewRequest
+from sasgeo_bench.tasks.suites.pictures import STOPS_M, Flight, PictureSuite, camera_beliefs
 
 SMALL = Variant(role="control", kind="control", view_cells=48, detector="rendered")
 
@@ -36,7 +36,7 @@ def place(scene):
 
 def shot_of(place, variant=SMALL, **site):
     scene, where = place
-    return Shot(scene=scene, site=replace(where, **site), variant=variant, seeds=Seeds(root=1, names=("here",)))
+    return ViewRequest(scene=scene, site=replace(where, **site), variant=variant, seeds=Seeds(root=1, names=("here",)))
 
 
 def test_no_suite_of_pictures_is_drawn_unless_it_is_named():
@@ -96,7 +96,7 @@ def test_a_camera_fixed_to_the_body_tilts_as_was_measured(place):
     tilts = []
     for index in range(400):
         shot = replace(shot_of(place, variant), seeds=Seeds(root=1, names=("here", str(index))))
-        tilts.append(stands_of(shot, pictures.OBLIQUE.flight(variant))[0].believed.tilt_deg)
+        tilts.append(camera_beliefs(shot, pictures.OBLIQUE.flight(variant))[0].believed.tilt_deg)
     median, high = np.quantile(tilts, (0.5, 0.95))
     assert abs(median - 9.6) < 1.0
     assert abs(high - 20.5) < 2.5
@@ -107,7 +107,7 @@ def test_a_true_camera_is_off_by_what_is_declared_and_flies_at_the_scale_of_its_
     off = []
     for index in range(300):
         shot = replace(shot_of(place, pose=pose), seeds=Seeds(root=1, names=("here", str(index))))
-        stand = stands_of(shot, Flight(height_m=100.0))[0]
+        stand = camera_beliefs(shot, Flight(height_m=100.0))[0]
         off.append(stand.true.tilt_deg)
         assert stand.true.height_m == pytest.approx(105.0)
         assert stand.believed.tilt_deg == pytest.approx(0.0)
@@ -115,7 +115,7 @@ def test_a_true_camera_is_off_by_what_is_declared_and_flies_at_the_scale_of_its_
 
 
 def test_nine_stops_end_where_the_query_is_and_drift_by_what_they_declare(place):
-    stands = stands_of(shot_of(place), Flight(stops_m=STOPS_M))
+    stands = camera_beliefs(shot_of(place), Flight(stops_m=STOPS_M))
     assert (stands[-1].believed.east_m, stands[-1].believed.north_m) == pytest.approx((0.0, 0.0))
     assert stands[-1].position_sigma_m == 0.0
     for stop, stand in zip(STOPS_M, stands, strict=True):

@@ -11,10 +11,10 @@ from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.tasks.query import CEILING
 from sasgeo_bench.tasks.suites.ages import STABLE, VOLATILE
-from sasgeo_bench.tasks.suites.base import Seeds, Shot, changed_share
+from sasgeo_bench.tasks.suites.base import Seeds, ViewRequest, changed_share
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
-from sasgeo_bench.tasks.suites.twins import OFF_M, Room, either, find_targets
+from sasgeo_bench.tasks.suites.twins import OFF_M, CopySpacing, either, find_targets
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 from sasgeo_bench.tasks.twin import around, paste
 from sasgeo_bench.tasks.vectors import as_features
@@ -316,7 +316,7 @@ def test_vectors_of_the_falsifier_are_of_the_same_one_of_both_places_whichever_i
     for site, pose in pairs(made):
         plain_at, changed_at = (pose, site.pose) if is_changed(site) else (site.pose, pose)
         wanted = changed_at if made.suite.falsifier_sees_change else plain_at
-        shot = Shot(scene=made.scene, site=site, variant=made.suite.variants[0], seeds=made.seeds)
+        shot = ViewRequest(scene=made.scene, site=site, variant=made.suite.variants[0], seeds=made.seeds)
         taken = made.suite._uninformative_pose(shot)
         assert (taken.easting_m, taken.northing_m) == (wanted.easting_m, wanted.northing_m)
         assert taken.yaw_deg == site.pose.yaw_deg
@@ -414,7 +414,7 @@ def test_sites_without_room_for_their_copies_are_left_out(scene, carried):
     seeds = Seeds(root=1, names=())
     sites = choose_sites(town, suite, count=99, seeds=seeds, group=suite.card.group, may_be_fewer=True)
     clear_m, apart_m = suite.clear_m(town), min_distance_m(96.0)
-    found = find_targets(town.map, sites, Room(clear_m=clear_m, spacing_m=apart_m), copies=1, seeds=seeds)
+    found = find_targets(town.map, sites, CopySpacing(clear_m=clear_m, spacing_m=apart_m), copies=1, seeds=seeds)
     assert len(found) < len(sites)
     assert {len(targets) for targets in found.values()} <= {1}
     edit = replace(suite, copies=1).edit(town, sites, seeds)

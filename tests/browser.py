@@ -43,8 +43,8 @@ class Page:
         for name in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{name}.enable")
 
-    def call(self, method: str, **said: Any) -> dict[str, Any]:
-        return self._pipe.call(method, session=self._session, **said)
+    def call(self, method: str, **changes: Any) -> dict[str, Any]:
+        return self._pipe.call(method, session=self._session, **changes)
 
     def open(self, url: str) -> None:
         """Open a page and wait until it is loaded."""
@@ -59,15 +59,15 @@ class Page:
 
     def value(self, script: str) -> Any:
         """What an expression is worth in the page."""
-        said = self.call("Runtime.evaluate", expression=script, returnByValue=True, userGesture=True)
-        assert "exceptionDetails" not in said, said["exceptionDetails"]
-        return said["result"].get("value")
+        given = self.call("Runtime.evaluate", expression=script, returnByValue=True, userGesture=True)
+        assert "exceptionDetails" not in given, given["exceptionDetails"]
+        return given["result"].get("value")
 
     def settled(self, script: str) -> Any:
         """What a promise comes to in the page."""
-        said = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
-        assert "exceptionDetails" not in said, said["exceptionDetails"]
-        return said["result"].get("value")
+        given = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in given, given["exceptionDetails"]
+        return given["result"].get("value")
 
     def press(self, key: str) -> None:
         """Press a key, as a hand would."""
@@ -100,8 +100,8 @@ class Page:
         """Write a picture of the whole page."""
         size = self.call("Page.getLayoutMetrics")["cssContentSize"]
         clip = {"x": 0, "y": 0, "width": size["width"], "height": min(size["height"], 6000), "scale": 1}
-        said = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
-        path.write_bytes(base64.b64decode(said["data"]))
+        given = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
+        path.write_bytes(base64.b64decode(given["data"]))
 
     @property
     def asked(self) -> list[str]:
@@ -127,9 +127,9 @@ class Pipe:
         self._rest, self._number = b"", 0
         self.events: list[dict[str, Any]] = []
 
-    def call(self, method: str, *, session: str | None = None, **said: Any) -> dict[str, Any]:
+    def call(self, method: str, *, session: str | None = None, **changes: Any) -> dict[str, Any]:
         self._number += 1
-        message = {"id": self._number, "method": method, "params": said}
+        message = {"id": self._number, "method": method, "params": changes}
         os.write(self._target, json.dumps(message | ({"sessionId": session} if session else {})).encode() + b"\0")
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
@@ -153,10 +153,10 @@ class Pipe:
                 raise EOFError("the browser has gone")
             self._rest += more
         text, _, self._rest = self._rest.partition(b"\0")
-        said = dict(json.loads(text))
-        if "method" in said:
-            self.events.append(said)
-        return said
+        record = dict(json.loads(text))
+        if "method" in record:
+            self.events.append(record)
+        return record
 
 
 @contextmanager

@@ -177,8 +177,8 @@ def program(
         monkeypatch.setattr("sys.argv", ["sasgeo-bench", *map(str, words)])
         with pytest.raises(SystemExit) as leaving:
             cli.main()
-        told = capsys.readouterr()
-        return int(leaving.value.code or 0), told.out, told.err
+        out = capsys.readouterr()
+        return int(leaving.value.code or 0), out.out, out.err
 
     return run
 

@@ -69,14 +69,14 @@ def asked_everything(share):
 
 
 def card_of(name, **changes):
-    said = {"name": name, "version": "1", "title": f"Title of {name}", "source": "original", "ours": "all of it"}
-    said |= {"licence": "MIT", "tracks": ["localization", "retrieval"], "needs": [], "limits": "", "trained_on": []}
-    return said | changes
+    values = {"name": name, "version": "1", "title": f"Title of {name}", "source": "original", "ours": "all of it"}
+    values |= {"licence": "MIT", "tracks": ["localization", "retrieval"], "needs": [], "limits": "", "trained_on": []}
+    return values | changes
 
 
 def entry_of(name, **changes):
-    said = {"name": name, "version": "1", "hash": "0123abcd", "how": "run here", "card": card_of(name), "learned": []}
-    return said | {"isolation": {"network": "none"}} | changes
+    values = {"name": name, "version": "1", "hash": "0123abcd", "how": "run here", "card": card_of(name), "learned": []}
+    return values | {"isolation": {"network": "none"}} | changes
 
 
 def about_of(entries, **changes):
@@ -84,10 +84,10 @@ def about_of(entries, **changes):
     tasks = [
         {"suite": "real-age", "region": name, "map_date": "2015-07-27", "queries_sha256": "ab"} for name in regions
     ]
-    said = {"scorer_version": SCORER_VERSION, "task_version": 1, "data_version": 1, "made_by": "sasgeo-bench 0.1.0"}
-    said |= {"libraries": {"numpy": "2"}, "pipeline": None, "split": "crossfit", "draws": 200, "by_region": []}
-    said |= {"rejectors": [], "remarks": [], "entries": entries, "tasks": tasks}
-    return BoardManifest.model_validate(said | changes)
+    values = {"scorer_version": SCORER_VERSION, "task_version": 1, "data_version": 1, "made_by": "sasgeo-bench 0.1.0"}
+    values |= {"libraries": {"numpy": "2"}, "pipeline": None, "split": "crossfit", "draws": 200, "by_region": []}
+    values |= {"rejectors": [], "remarks": [], "entries": entries, "tasks": tasks}
+    return BoardManifest.model_validate(values | changes)
 
 
 def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), scored=None, extras=(), **about):
@@ -194,7 +194,7 @@ def put_pictures(folder, *, failures=("aliased", "occluded", "odd one"), **chang
     names = ["vaduz.png", "example.png", *(f"cases/{at}.png" for at in range(len(failures)))]
     for name in names:
         cv2.imwrite(str(home / name), image)
-    said = {
+    values = {
         "regions": [
             {"region": "vaduz", "file": "vaduz.png", "alt": "Vaduz from above", "bounds_m": BOUNDS_M}
             | {"blocks": [{"name": f"vaduz/0-0 {MARKUP}", "bounds_m": BOUNDS_M}]}
@@ -207,7 +207,7 @@ def put_pictures(folder, *, failures=("aliased", "occluded", "odd one"), **chang
             for at, failure in enumerate(failures)
         ],
     }
-    (home / "pictures.json").write_text(json.dumps(said | changes), encoding="utf-8")
+    (home / "pictures.json").write_text(json.dumps(values | changes), encoding="utf-8")
 
 
 def many_rows(count):

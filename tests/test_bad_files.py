@@ -138,14 +138,14 @@ def answers_of(task: Path) -> list[Prediction]:
 
 
 def about_of(task: Path) -> RunManifest:
-    said = task_files.read_task(task)
+    result = task_files.read_task(task)
     return RunManifest(
         schema_version=1,
         matcher=card_of("mine"),
         spec="mine",
         hash="0123456789ab",
-        **{name: said[name] for name in ("suite", "region", "task_version", "map_fingerprint")},
-        queries_sha256=said["files"][task_files.QUERIES]["sha256"],
+        **{name: result[name] for name in ("suite", "region", "task_version", "map_fingerprint")},
+        queries_sha256=result["files"][task_files.QUERIES]["sha256"],
         top_k=5,
         learned={"key": "ab", "file": None, "trained_on": ["porto"], "pairs": 3},
         cpu_s=1.5,
@@ -168,7 +168,7 @@ def make_submission(folder: Path, tiny: TinyPlace) -> None:
     task = task_of(tiny)
     card = parse_toml(example_card("mine"), Card, source="card")
     asked = AnsweredTask(suite="clean", region="here", queries_sha256="0" * 64, queries=1, answered=1)
-    said = Submission(
+    result = Submission(
         schema_version=1,
         card=card,
         board="demo",
@@ -182,7 +182,7 @@ def make_submission(folder: Path, tiny: TinyPlace) -> None:
         licence="ODbL-1.0",
         attribution="OpenStreetMap",
     )
-    write_submission(folder / "mine", said, answers_of(task), task_files.Task.open(task).asked)
+    write_submission(folder / "mine", result, answers_of(task), task_files.Task.open(task).asked)
 
 
 def make_pack(folder: Path, tiny: TinyPlace) -> None:
@@ -207,8 +207,8 @@ def make_board(folder: Path, _: TinyPlace) -> None:
 
 def make_ageing(folder: Path, _: TinyPlace) -> None:
     table = pd.DataFrame({name: pd.Series([], dtype=kind) for name, kind in DTYPES.items()})
-    said = {"place": "here", "sources": ["a of 2020-01-01"], "area_km2": 1.0}
-    write_frame(table, folder / "ageing.parquet", attrs=said)
+    values = {"place": "here", "sources": ["a of 2020-01-01"], "area_km2": 1.0}
+    write_frame(table, folder / "ageing.parquet", attrs=values)
 
 
 def make_ranking(folder: Path, _: TinyPlace) -> None:
@@ -460,13 +460,13 @@ def list_again(folder: Path, item: Format) -> None:
     path, manifest = folder / item.file, folder / item.listed
     if not item.listed or path == manifest:
         return
-    said = json.loads(manifest.read_text(encoding="utf-8"))
+    record = json.loads(manifest.read_text(encoding="utf-8"))
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.relative_to(manifest.parent).as_posix()
-    said["files"][name] = (
-        digest if isinstance(said["files"][name], str) else {"sha256": digest, "bytes": path.stat().st_size}
+    record["files"][name] = (
+        digest if isinstance(record["files"][name], str) else {"sha256": digest, "bytes": path.stat().st_size}
     )
-    manifest.write_text(json.dumps(said), encoding="utf-8")
+    manifest.write_text(json.dumps(record), encoding="utf-8")
 
 
 def check_reading(folder: Path, item: Format, data: bytes) -> None:

@@ -273,10 +273,10 @@ def enter_suites(document: str, monkeypatch: pytest.MonkeyPatch) -> None:
 def told(words: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
     """Exit status of the program, and all that it said."""
     monkeypatch.setattr(sys, "argv", words)
-    said = io.StringIO()
-    with redirect_stdout(said), redirect_stderr(said), pytest.raises(SystemExit) as leaving:
+    given = io.StringIO()
+    with redirect_stdout(given), redirect_stderr(given), pytest.raises(SystemExit) as leaving:
         cli.main()
-    return int(leaving.value.code or 0), said.getvalue()
+    return int(leaving.value.code or 0), given.getvalue()
 
 
 def by_one_process(words: list[str]) -> list[str]:
@@ -298,5 +298,5 @@ def test_the_commands_of_a_document_do_what_they_say(
     for line in commands(document):
         if RUN.get(line.text) is not None and RUN[line.text] == line:
             with nullcontext() if line.words[1] == "check" else threaded():
-                code, said = told(by_one_process(line.words), monkeypatch)
-            assert code == 0, f"{document}:{line.number}: {line.text}\n{said}"
+                code, given = told(by_one_process(line.words), monkeypatch)
+            assert code == 0, f"{document}:{line.number}: {line.text}\n{given}"

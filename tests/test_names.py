@@ -52,13 +52,13 @@ def test_titles_of_files_are_lines_of_printable_characters(text):
     halves = {"vaduz": "a", "eschen": "a", "monaco": "b", "porto": "b"}
     places = [{"name": name, "regions": [name], "half": half} for name, half in halves.items()]
     task = [{"suites": ["clean"], "sites": 1}]
-    for model, said in (
+    for model, each in (
         (SplitFile, {"id": "mine", "kind": "crossfit", "buffer_m": 0.0, "place": places}),
         (PipelineFile, {"id": "mine", "split": "crossfit", "matchers": ["random"], "task": task}),
     ):
-        check_document(said | {"title": r"cost $\nosuchthing$ | <b>"}, model, source="a.toml")
+        check_document(each | {"title": r"cost $\nosuchthing$ | <b>"}, model, source="a.toml")
         with pytest.raises(ConfigError, match="title"):
-            check_document(said | {"title": text}, model, source="a.toml")
+            check_document(each | {"title": text}, model, source="a.toml")
     contrast = {"name": "a", "first": "b", "second": "c", "suites": ["clean"]}
     for key, wrong in (("why", "a\x1bb"), ("kinds", [text])):
         with pytest.raises(ConfigError, match=key):
@@ -72,8 +72,8 @@ def test_every_shipped_and_stored_name_and_version_is_one():
         shipped += [*spec.matchers, *spec.rejectors]
     cards = []
     for path in ROOT.glob("docs/results/*/board.json"):
-        said = json.loads(path.read_text(encoding="utf-8"))
-        cards += [entry["card"] for entry in said["entries"] if entry["card"]] + said["rejectors"]
+        record = json.loads(path.read_text(encoding="utf-8"))
+        cards += [entry["card"] for entry in record["entries"] if entry["card"]] + record["rejectors"]
     assert len(cards) > 20
     for name in {*shipped, *(card["name"] for card in cards)}:
         assert re.fullmatch(NAME, name), name

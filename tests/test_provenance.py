@@ -86,11 +86,11 @@ def test_a_region_of_an_older_file_gets_its_lines_and_stays_the_same_map(tmp_pat
     before = {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
     old = read_manifest(folder)
     assert not old.provenance.titled()
-    plan, told = plan_build(spec_of(**STATED), out=out), []
+    plan, given = plan_build(spec_of(**STATED), out=out), []
     assert not plan.is_current
-    with reporting(told.append):
+    with reporting(given.append):
         made = build_region(plan)
-    assert f"{TOWN}: its provenance alone has changed: only region.json is written" in told
+    assert f"{TOWN}: its provenance alone has changed: only region.json is written" in given
     assert made == read_manifest(folder).model_copy(update={"provenance": made.provenance})
     assert (made.fingerprint, made.inputs_sha256, made.files) == (old.fingerprint, old.inputs_sha256, old.files)
     after = {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}

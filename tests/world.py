@@ -26,8 +26,8 @@ def built(spec: RegionFile | str, out: Path, **options: Any) -> Path:
 
 def drawn(out: Path, suite: str, *regions: str, **changes: Any) -> list[Path]:
     """Draw a suite in regions, which are built where they are missing; return the folders of the tasks."""
-    said = {"split": "crossfit", "count": 1, "seed": 0} | changes
-    wanted = TaskRequest(suites=(suite,), regions=regions, out=out, **said)
+    values = {"split": "crossfit", "count": 1, "seed": 0} | changes
+    wanted = TaskRequest(suites=(suite,), regions=regions, out=out, **values)
     for request in plan_requests(wanted):
         make_tasks(request)
     return [out / "tasks" / suite / region for region in regions]

@@ -83,8 +83,8 @@ def value(tables, place, name, span, column):
 
 def test_every_percentage_of_the_findings_is_that_of_the_tables_in_their_order(tables, text):
     findings = text.split("## What the data say")[1].split("## Using the rates")[0]
-    said = re.findall(r"(?<![\d.])\d+\.\d+(?=\s+%|\s+to\s+\d+\.\d+\s+%)", findings)
-    assert said == [f"{value(tables, *where):.{digits}f}" for *where, digits in SAID]
+    given = re.findall(r"(?<![\d.])\d+\.\d+(?=\s+%|\s+to\s+\d+\.\d+\s+%)", findings)
+    assert given == [f"{value(tables, *where):.{digits}f}" for *where, digits in SAID]
 
 
 def test_as_many_classes_grow_faster_than_was_set_by_hand_as_the_page_says(tables, text):
@@ -106,8 +106,8 @@ def test_every_place_stands_on_the_page_as_in_the_summary(text):
 
 
 def test_every_column_of_the_tables_is_told_of(tables, text):
-    told = set(re.findall(r"`([a-z0-9_*]+)`", text.split("## Columns")[1].split("##")[0]))
-    patterns = [re.compile(name.replace("*", r"\w*")) for name in told]
+    given = set(re.findall(r"`([a-z0-9_*]+)`", text.split("## Columns")[1].split("##")[0]))
+    patterns = [re.compile(name.replace("*", r"\w*")) for name in given]
     numbers = [name for name, kind in tables["monaco"].dtypes.items() if kind.kind in "fi" and name != "years"]
     assert [name for name in numbers if not any(pattern.fullmatch(name) for pattern in patterns)] == []
 

@@ -34,6 +34,6 @@ def test_ten_places_of_three_countries_have_maps_eight_years_apart(places, split
     found, countries = map(int, re.search(r"8 years \| (\d+) \| (\d+)", places["summary"](split)).groups())
     assert found >= 10
     assert countries >= 3
-    said = " ".join((ROOT / "splits" / "README.md").read_text(encoding="utf-8").split())
-    assert f"{len(dict(places['dated_places'](split)))} real places" in said
-    assert f"of which {found} have maps at least eight years apart" in said
+    message = " ".join((ROOT / "splits" / "README.md").read_text(encoding="utf-8").split())
+    assert f"{len(dict(places['dated_places'](split)))} real places" in message
+    assert f"of which {found} have maps at least eight years apart" in message

@@ -132,8 +132,8 @@ def test_rings_of_which_little_is_known_are_not_judged(made, region, seen):
     cells[:, 56:, :] = UNKNOWN
     matcher = PolarVsc()
     matcher.prepare(region, None)
-    told = matcher.match(made.query_of(seen.replace(cells), PRIOR), top_k=2).diagnostics
-    assert (told["ks_share"], told["ks_p"]) == (0.0, 1.0)
+    diagnostics = matcher.match(made.query_of(seen.replace(cells), PRIOR), top_k=2).diagnostics
+    assert (diagnostics["ks_share"], diagnostics["ks_p"]) == (0.0, 1.0)
 
 
 # Building ratios

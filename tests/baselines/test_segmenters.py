@@ -44,11 +44,11 @@ def test_every_segmenter_is_found_by_the_name_on_its_card(name, spec):
 
 def test_the_forest_tells_classes_of_a_place_that_it_has_not_seen(learned):
     for labelled in ASKED:
-        said = PixelForest().segment(labelled.image, learned=learned)
-        assert said.classes == labelled.classes
-        assert said.shape == labelled.image.shape
+        given = PixelForest().segment(labelled.image, learned=learned)
+        assert given.classes == labelled.classes
+        assert given.shape == labelled.image.shape
         for name in ("building", "water", "green"):
-            assert ranked(labelled, said, name) > 0.9
+            assert ranked(labelled, given, name) > 0.9
 
 
 def test_the_same_pictures_teach_the_same_text(learned):
@@ -142,7 +142,7 @@ def test_a_hole_in_a_mosaic_is_passed_over_in_silence_and_an_overexposed_roof_is
 
 def test_thresholds_know_grass_from_ponds_and_need_no_training():
     for labelled in PICTURES:
-        said = ColourThresholds().segment(labelled.image, learned=None)
-        assert said.classes == ColourThresholds.card.classes
-        assert ranked(labelled, said, "green") > 0.8
-        assert ranked(labelled, said, "water") > 0.8
+        given = ColourThresholds().segment(labelled.image, learned=None)
+        assert given.classes == ColourThresholds.card.classes
+        assert ranked(labelled, given, "green") > 0.8
+        assert ranked(labelled, given, "water") > 0.8

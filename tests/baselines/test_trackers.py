@@ -352,16 +352,16 @@ def winding(count, *, spacing_m=50.0, start_m=(2000.0, 1000.0)):
 
 def views_of(poses, *, seed=0, evidence=None, radius_m=300.0, lost=(), jumps=()):
     """The queries of a flight; at `jumps` the odometer says the step before once more."""
-    rng, queries, told = np.random.default_rng(seed), [], None
+    rng, queries, step = np.random.default_rng(seed), [], None
     for frame, pose in enumerate(poses):
         step = Step(sequence_id="f", frame=frame)
         if frame and frame not in lost:
             before = poses[frame - 1]
             off_m = np.array([pose.easting_m - before.easting_m, pose.northing_m - before.northing_m])
             if frame not in jumps:
-                told = np.array([*(rotation(before.yaw_deg).T @ off_m), float(wrap_deg(pose.yaw_deg - before.yaw_deg))])
+                step = np.array([*(rotation(before.yaw_deg).T @ off_m), float(wrap_deg(pose.yaw_deg - before.yaw_deg))])
             noise = np.array(SIGMAS) * rng.standard_normal(3)
-            increment = tuple((told * [SCALE, SCALE, 1.0] + noise).tolist())
+            increment = tuple((step * [SCALE, SCALE, 1.0] + noise).tolist())
             covariance = tuple(np.diag(np.square(SIGMAS)).ravel().tolist())
             step = replace(step, increment=increment, covariance=covariance)
         queries.append(
@@ -548,8 +548,8 @@ def test_a_fix_of_half_the_confidence_has_twice_the_covariance():
     tracker.start(NOTHING)
     query = views_of([here])[0]
     sure, half, none = (
-        tracker.covariance_of(Match(poses=[here], scores=[1.0], diagnostics=said), query)
-        for said in ({"ks_share": 1.0}, {"ks_share": 0.5}, {"ks_share": 0.0})
+        tracker.covariance_of(Match(poses=[here], scores=[1.0], diagnostics=each), query)
+        for each in ({"ks_share": 1.0}, {"ks_share": 0.5}, {"ks_share": 0.0})
     )
     assert np.allclose(half, 2 * sure)
     assert np.allclose(none, 10 * sure)

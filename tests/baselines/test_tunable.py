@@ -119,10 +119,10 @@ def test_a_system_that_fails_costs_its_own_trials_and_old_settings_are_left_out(
     old = replace(trials[0], setting='{"pixel_m": 2.0}')
     open_numbers.write_trials(tmp_path / "trials.csv", [*trials[6:], old])
     open_numbers.try_all(tmp_path, {"brm_grid": SYSTEMS["brm_grid"], "my-failing": Failing}, jobs=1)
-    said = capsys.readouterr().out
-    assert "1 stored trial left out: of numbers that are open no more" in said
-    assert 'my-failing {"sharpness": 2.0}: no trial (ValueError: too sharp)' in said
-    assert [line.split("|")[1].strip() for line in said.splitlines() if line.startswith("| `")] == ["`brm_grid`"]
+    out = capsys.readouterr().out
+    assert "1 stored trial left out: of numbers that are open no more" in out
+    assert 'my-failing {"sharpness": 2.0}: no trial (ValueError: too sharp)' in out
+    assert [line.split("|")[1].strip() for line in out.splitlines() if line.startswith("| `")] == ["`brm_grid`"]
     stored = open_numbers.read_trials(tmp_path / "trials.csv")
     assert [trial.system for trial in stored] == ["brm_grid"] * 6 + ["my-failing"] + ["polar_vsc"] * 6
 

@@ -202,12 +202,12 @@ def test_a_perfect_view_agrees_in_all_classes_and_stands_out(made, variant) -> N
     matcher.prepare(region, None)
     for candidates in ((), PLACES):
         prior = KNOWN_YAW if candidates else NEAR_HERE
-        said = matcher.match(made.query_of(view, prior, candidates=candidates), top_k=3).diagnostics
-        assert said["class_agreement"] > 0.8
-        assert said["null_score"] > 3
-        assert said["margin"] > 0
-        assert ("graph_distance" in said) == ("graph" in variant.card.name or variant is FullUnknown)
-        assert 0 <= said.get("graph_distance", 0) < 0.1
+        diagnostics = matcher.match(made.query_of(view, prior, candidates=candidates), top_k=3).diagnostics
+        assert diagnostics["class_agreement"] > 0.8
+        assert diagnostics["null_score"] > 3
+        assert diagnostics["margin"] > 0
+        assert ("graph_distance" in diagnostics) == ("graph" in variant.card.name or variant is FullUnknown)
+        assert 0 <= diagnostics.get("graph_distance", 0) < 0.1
 
 
 def test_agreement_is_the_mean_over_classes_of_both_over_either(made) -> None:

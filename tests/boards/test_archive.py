@@ -95,17 +95,17 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
     _, plan, folder, _ = kept
     shutil.copytree(plan.out, tmp_path / "out", ignore=shutil.ignore_patterns("boards", "runs"))
     other = tmp_path / "out" / "tasks" / "clean" / "town-agricultural"
-    said = json.loads((other / "task.json").read_text(encoding="utf-8"))
-    said["files"]["queries.parquet"]["sha256"] = "0" * 64
-    (other / "task.json").write_text(json.dumps(said), encoding="utf-8")
+    record = json.loads((other / "task.json").read_text(encoding="utf-8"))
+    record["files"]["queries.parquet"]["sha256"] = "0" * 64
+    (other / "task.json").write_text(json.dumps(record), encoding="utf-8")
     lines = []
     monkeypatch.setattr(build, "figures_extra", lambda *_, **__: AdditionalFiles())
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path / "out")
     with reporting(lines.append):
         score_all(replace(usual, draws=100, rejectors=()))
-    said = json.loads((tmp_path / "again" / "pictures" / "pictures.json").read_text(encoding="utf-8"))
-    assert len(said["regions"]) == 1
-    assert {case["region"] for case in said["cases"]} == {"town-suburb"}
+    record = json.loads((tmp_path / "again" / "pictures" / "pictures.json").read_text(encoding="utf-8"))
+    assert len(record["regions"]) == 1
+    assert {case["region"] for case in record["cases"]} == {"town-suburb"}
     assert f"pictures of 1 of 2 tasks: {tmp_path / 'out' / 'tasks'} lacks the views of the rest" in lines
 
 
@@ -144,8 +144,8 @@ def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
     learned = pq.read_table(folder / "runs.parquet")["learned"].to_pylist()
     assert len({text for text in learned if text is not None}) == 2  # one of each half
     count = sum(len(rows) for rows in board.predictions.values())
-    (said,) = [line for line in lines if f"{count} predictions" in line]
-    assert said.startswith(f"{folder}: 0.")
+    (given,) = [line for line in lines if f"{count} predictions" in line]
+    assert given.startswith(f"{folder}: 0.")
     assert read_pack(folder).dropped == ""
 
 
@@ -254,9 +254,9 @@ def test_damaged_results_are_told_in_a_line(kept, tmp_path, name, words, program
 @pytest.mark.parametrize("name", ["mischief:Rejector", "no_such_rejector"])
 def test_stored_results_have_no_code_imported_that_no_package_registers(kept, program, tmp_path, monkeypatch, name):
     stored = shutil.copytree(kept[2], tmp_path / "stored")
-    said = json.loads((stored / "pack.json").read_text(encoding="utf-8"))
-    said["rejectors"] = ["margin_nms", name]
-    (stored / "pack.json").write_text(json.dumps(said), encoding="utf-8")
+    record = json.loads((stored / "pack.json").read_text(encoding="utf-8"))
+    record["rejectors"] = ["margin_nms", name]
+    (stored / "pack.json").write_text(json.dumps(record), encoding="utf-8")
     (tmp_path / "mischief.py").write_text("import pathlib; pathlib.Path('imported').touch()", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -279,10 +279,10 @@ def test_named_on_the_command_line_code_judges_stored_results(kept):
 
 def hash_again(folder, **changes):
     """Make what pack.json says true of whatever lies there now."""
-    said = json.loads((folder / "pack.json").read_text(encoding="utf-8")) | changes
+    record = json.loads((folder / "pack.json").read_text(encoding="utf-8")) | changes
     paths = [path for path in folder.rglob("*") if path.is_file() and path.name != "pack.json"]
-    said["files"] = {path.relative_to(folder).as_posix(): sha256_of(path) for path in paths}
-    (folder / "pack.json").write_text(json.dumps(said), encoding="utf-8")
+    record["files"] = {path.relative_to(folder).as_posix(): sha256_of(path) for path in paths}
+    (folder / "pack.json").write_text(json.dumps(record), encoding="utf-8")
 
 
 @pytest.fixture
@@ -291,10 +291,10 @@ def own(kept, tmp_path):
 
 
 def test_every_file_of_stored_results_has_its_hash(kept):
-    said = json.loads((kept[2] / "pack.json").read_text(encoding="utf-8"))
+    record = json.loads((kept[2] / "pack.json").read_text(encoding="utf-8"))
     there = {path.relative_to(kept[2]).as_posix(): path for path in kept[2].rglob("*") if path.is_file()}
-    assert said["files"].keys() == there.keys() - {"pack.json"}
-    assert all(sha256_of(there[name]) == digest for name, digest in said["files"].items())
+    assert record["files"].keys() == there.keys() - {"pack.json"}
+    assert all(sha256_of(there[name]) == digest for name, digest in record["files"].items())
 
 
 @pytest.mark.parametrize("name", ["board.json", "predictions.parquet"])
@@ -359,9 +359,9 @@ def test_a_former_file_with_an_answer_too_many_is_refused(own, mistake):
 
 def test_results_of_the_first_version_are_read_without_hashes_and_may_be_replaced(kept, own, tmp_path):
     as_former(own, 1)
-    said = json.loads((own / "pack.json").read_text(encoding="utf-8"))
-    del said["files"]
-    (own / "pack.json").write_text(json.dumps(said), encoding="utf-8")
+    record = json.loads((own / "pack.json").read_text(encoding="utf-8"))
+    del record["files"]
+    (own / "pack.json").write_text(json.dumps(record), encoding="utf-8")
     former = shutil.copytree(own, tmp_path / "former")
     assert read_pack(own).files is None
     assert len(unpack(own, tmp_path / "into").runs) == len(pq.read_table(own / "runs.parquet"))
@@ -430,8 +430,8 @@ def test_publishing_stored_results_whose_tables_are_of_another_version_says_so(o
 )
 def test_settings_of_another_type_are_one_line(own, mistake, text, fault):
     if text.startswith("{"):
-        said = json.loads((own / "pack.json").read_text(encoding="utf-8")) | json.loads(text)
-        text = json.dumps(said).replace("Infinity", "1e400")
+        record = json.loads((own / "pack.json").read_text(encoding="utf-8")) | json.loads(text)
+        text = json.dumps(record).replace("Infinity", "1e400")
     (own / "pack.json").write_text(text, encoding="utf-8")
     line = mistake("score", "--predictions", own)
     assert fault in line

@@ -82,8 +82,8 @@ def board(tmp_path_factory):
         for rejector in ("margin", "sure")
     }
     table = leaderboard(tables, draws=100)
-    said = {"rejector": "sure", "metric": "ece", "suite": "all suites", "stratum": "as drawn", "value": 0.1}
-    rows = [table.iloc[[0]].assign(matcher=name, **said) for name in ("raster", "graph")]
+    values = {"rejector": "sure", "metric": "ece", "suite": "all suites", "stratum": "as drawn", "value": 0.1}
+    rows = [table.iloc[[0]].assign(matcher=name, **values) for name in ("raster", "graph")]
     levels = {level_name("gauss", 1e-2): 10.0}
     return Scored(
         board=Board(
@@ -124,8 +124,8 @@ def unanswered(board):
 
 @pytest.mark.slow
 def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path):
-    told = []
-    with reporting(told.append):
+    lines = []
+    with reporting(lines.append):
         figures = figures_extra(board, contrasts=CONTRASTS).figures
     assert set(figures) == {
         "age-real-age-localization-r500-weak-s3.svg",
@@ -140,7 +140,7 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
         "reliability-localization-r500-weak-s3.svg",
         "stanford-0.01-r500-weak-s3.svg",
     }
-    (line,) = told
+    (line,) = lines
     assert line == (
         "figures left out, for nothing on this board is seen in them: success against strength; error along the "
         "way; how far the odometer carries a fix; recall against K; success against cost; success against the drift of "
@@ -158,21 +158,21 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
 
 
 def test_a_board_without_data_has_no_figures_and_says_so(board):
-    told = []
+    lines = []
     bare = replace(
         of_table(board, board.board.leaderboard),
         judged={},
         measured={},
         predictions=dict.fromkeys(board.scores, StoredAnswers.of([])),
     )
-    with reporting(told.append):
+    with reporting(lines.append):
         assert set(figures_extra(unanswered(bare)).figures) == {
             "strength-real-age-localization-r500-weak-s3.svg",
             "stress-localization-r500-weak-s3.svg",
             "ablation-localization-r500-weak-s3.svg",
             "errors-localization-r500-weak-s3.svg",
         }
-    (line,) = told
+    (line,) = lines
     assert line.partition(": ")[2].split("; ") == [
         "registered contrasts, place by place",
         "success against the age of the map",
@@ -258,14 +258,14 @@ def test_a_curve_ends_where_all_answers_are_accepted_and_mixtures_are_of_all_sui
 
 def test_areas_of_a_stanford_figure_are_those_of_the_board(board):
     answers, table = board.predictions["graph"], board.scores["graph"]
-    (told,) = protection_levels(table, answers)
-    areas = stanford_areas(told, 25.0)
-    assert sum(areas.values()) == stanford_cells(told)["n"].sum() == COUNT
+    (given,) = protection_levels(table, answers)
+    areas = stanford_areas(given, 25.0)
+    assert sum(areas.values()) == stanford_cells(given)["n"].sum() == COUNT
     frame = protection_frame("graph", table, answers)
     (row,) = frame[frame["alert_limit_m"] == 25.0].to_dict("records")
     assert areas["hazardous"] == round(COUNT * row["hazardous"])
     assert areas["misleading"] == round(COUNT * (row["misleading"] - row["hazardous"]))
-    cells = stanford_cells(told)
+    cells = stanford_cells(given)
     absent = int((~table["is_present"]).sum())  # an error without end
     assert cells.loc[cells["error_m"] == BEYOND_M, "n"].sum() == absent
 

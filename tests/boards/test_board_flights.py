@@ -129,21 +129,21 @@ def test_stored_results_give_the_same_board(out):
 
 
 def test_a_run_of_flights_is_listed_and_its_worst_flight_drawn(out, program):
-    code, told, _ = program("inspect", str(out / "runs" / "far"), "--out", str(out))
+    code, printed, _ = program("inspect", str(out / "runs" / "far"), "--out", str(out))
     assert code == 0
-    assert "far: 6 flights, the worst first (--query draws one)" in told
-    path = told.rpartition("map of the worst flight: ")[2].strip()
+    assert "far: 6 flights, the worst first (--query draws one)" in printed
+    path = printed.rpartition("map of the worst flight: ")[2].strip()
     assert cv2.imread(path).shape[1] > 300
     flight = read_scores(out / "boards" / "mine")["query_id"].iloc[0]
-    code, told, _ = program("inspect", str(out / "runs" / "far"), "--query", flight[:10], "--out", str(out))
-    assert (code, told) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")
+    code, printed, _ = program("inspect", str(out / "runs" / "far"), "--query", flight[:10], "--out", str(out))
+    assert (code, printed) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")
 
 
 def test_a_flight_is_named_by_a_beginning_or_a_view_of_its_own_and_by_nothing_else(out, program):
     run_folder = str(out / "runs" / "far")
     flight = read_scores(out / "boards" / "mine")["query_id"].iloc[0]
-    code, told, _ = program("inspect", run_folder, "--query", f"{flight}000003", "--out", str(out))
-    assert (code, told) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")
+    code, printed, _ = program("inspect", run_folder, "--query", f"{flight}000003", "--out", str(out))
+    assert (code, printed) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")
     for query, why in (("", "--query is empty"), ("../../", "was asked no query"), ("zz", "was asked no query")):
         code, _, err = program("inspect", run_folder, "--query", query, "--out", str(out))
         assert code == 2

@@ -101,11 +101,11 @@ def made(root, tmp_path_factory):
 
 def test_a_board_lists_its_pictures_and_each_of_them_is_small(made):
     folder, lines, _ = made
-    said = json.loads((folder / "pictures" / "pictures.json").read_text(encoding="utf-8"))
-    assert said["attribution"] == "(c) OpenStreetMap contributors, ODbL"
-    assert [one["region"] for one in said["regions"]] == ["town-grid", "town-riverside"]
-    assert [one["suite"] for one in said["suites"]] == ["absent", "alias"]
-    listed = {one["file"]: kind for kind in ("regions", "suites", "cases") for one in said[kind]}
+    record = json.loads((folder / "pictures" / "pictures.json").read_text(encoding="utf-8"))
+    assert record["attribution"] == "(c) OpenStreetMap contributors, ODbL"
+    assert [one["region"] for one in record["regions"]] == ["town-grid", "town-riverside"]
+    assert [one["suite"] for one in record["suites"]] == ["absent", "alias"]
+    listed = {one["file"]: kind for kind in ("regions", "suites", "cases") for one in record[kind]}
     files = {path.relative_to(folder / "pictures").as_posix() for path in (folder / "pictures").rglob("*.webp")}
     assert files == set(listed)
     most = {"regions": REGION_BYTES, "suites": SUITE_BYTES, "cases": CASE_BYTES}
@@ -113,7 +113,7 @@ def test_a_board_lists_its_pictures_and_each_of_them_is_small(made):
     assert all(size <= most[listed[name]] for name, size in sizes.items())
     assert sum(sizes.values()) <= MOST_BYTES
     assert all(cv2.imread(str(folder / "pictures" / name)) is not None for name in files)
-    assert lines[-1].startswith(f"pictures: 2 of regions, 2 of suites, {len(said['cases'])} of cases, ")
+    assert lines[-1].startswith(f"pictures: 2 of regions, 2 of suites, {len(record['cases'])} of cases, ")
 
 
 @pytest.mark.slow
@@ -199,8 +199,8 @@ def case_at(root, suite, region, number=0, **changes):
     truths = {truth.query_id: truth for truth in task_files.read_truths(root / "truth" / suite / region)}
     query = list(task_files.read_queries(task))[number]
     truth = truths[query.query_id]
-    said = {"prediction": answer(query, truth, 0), "failure": "other", **changes}
-    return Case(matcher="mine", query=query, truth=truth, **said), task_files.Task.open(task)
+    values = {"prediction": answer(query, truth, 0), "failure": "other", **changes}
+    return Case(matcher="mine", query=query, truth=truth, **values), task_files.Task.open(task)
 
 
 @pytest.mark.parametrize(
@@ -213,8 +213,8 @@ def case_at(root, suite, region, number=0, **changes):
 )
 def test_any_query_has_a_picture_answered_or_not_and_the_same_each_time(root, asked, prediction):
     changes = {} if prediction == "answer" else {"prediction": prediction}
-    said = {"p_false": {"sure": 0.25}, "orders": {"margin": 0.5}, "accepted": {"sure": True}}
-    case, task = case_at(root, *asked, **said, **changes)
+    values = {"p_false": {"sure": 0.25}, "orders": {"margin": 0.5}, "accepted": {"sure": True}}
+    case, task = case_at(root, *asked, **values, **changes)
     picture = read_picture(case, task)
     first, again = case_pixels(picture), case_pixels(read_picture(case, task))
     assert first.dtype == np.uint8
@@ -232,9 +232,9 @@ def test_what_orders_answers_alone_is_told_apart_from_a_probability():
         ("mine", "margin"): rows.assign(is_calibrated=False).set_index("query_id"),
         ("mine", "own"): rows.set_index("query_id"),
     }
-    said = words_of(words, "mine", "q")
-    assert (said["orders"], said["p_false"]) == ({"margin": 0.75}, {"own": 0.75})
-    assert said["accepted"] == {"margin": True, "own": True}
+    given = words_of(words, "mine", "q")
+    assert (given["orders"], given["p_false"]) == ({"margin": 0.75}, {"own": 0.75})
+    assert given["accepted"] == {"margin": True, "own": True}
 
 
 def test_the_map_of_a_case_holds_both_places(root):
@@ -249,9 +249,9 @@ def test_the_map_of_a_case_holds_both_places(root):
 
 def test_what_is_not_known_of_a_case_is_not_said(root):
     case, _ = case_at(root, "absent", "town-riverside", prediction=None)
-    said = facts_of(case)
-    assert said["status"] == "missing"
-    assert not {"error_m", "confidence", "score_margin"} & set(said)
+    given = facts_of(case)
+    assert given["status"] == "missing"
+    assert not {"error_m", "confidence", "score_margin"} & set(given)
     with_nan = Prediction(query_id=case.query.query_id, diagnostics={"odd": float("inf")})
     assert "told_odd" not in facts_of(replace(case, prediction=with_nan))
     assert facts_of(replace(case, prediction=with_nan))["status"] == "withheld"

@@ -103,8 +103,8 @@ def test_the_strip_stands_on_the_first_page_with_its_attribution(board):
 
 def test_the_strip_of_a_board_is_drawn_as_a_png_of_its_best_run(board, program):
     out = board.parents[1]
-    code, told, _ = program("inspect", str(board), "--strip", "3", "--out", str(out))
-    assert (code, told) == (0, f"strip: {out / 'sheets' / 'strip-better.png'}\n")
+    code, printed, _ = program("inspect", str(board), "--strip", "3", "--out", str(out))
+    assert (code, printed) == (0, f"strip: {out / 'sheets' / 'strip-better.png'}\n")
     assert cv2.imread(str(out / "sheets" / "strip-better.png")).shape[1] > 800
 
 

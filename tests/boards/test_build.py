@@ -106,8 +106,8 @@ def split():
     grids = {town: read_region_file(find_region_file(town)).grid() for town in halves}
     spec = read_split_file(find_split_file("crossfit"))
     places = [{"name": f"place-{town}", "regions": [town], "half": half} for town, half in halves.items()]
-    said = {"id": "towns", "title": "Towns", "kind": "crossfit", "buffer_m": 0.0, "reach_m": spec.reach_m}
-    return make_split(SplitFile.model_validate(said | {"place": places}), grids)
+    values = {"id": "towns", "title": "Towns", "kind": "crossfit", "buffer_m": 0.0, "reach_m": spec.reach_m}
+    return make_split(SplitFile.model_validate(values | {"place": places}), grids)
 
 
 def board_of(out, *predictions, has_texts=False, extras=(), **changes):
@@ -160,9 +160,9 @@ def test_an_entry_of_which_some_answers_came_packed_says_so_on_every_board(out, 
     assert {entry.how for entry in find_entries([tmp_path / "runs"])} == {"run here"}
     mark_packed(run.parent, "ab" * 32)
     name = json.loads(run.read_text())["matcher"]["name"]
-    said = {entry.name: entry.how for entry in find_entries([tmp_path / "runs"])}
-    assert said.pop(name) == "answers came packed"
-    assert "answers came packed" not in said.values()
+    values = {entry.name: entry.how for entry in find_entries([tmp_path / "runs"])}
+    assert values.pop(name) == "answers came packed"
+    assert "answers came packed" not in values.values()
 
 
 def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_path):
@@ -186,9 +186,9 @@ def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_pa
     assert about.libraries["numpy"] == np.__version__
     assert about.pipeline is None
     assert about.rejectors == []
-    said = pq.read_schema(out / "boards" / "mine" / "leaderboard.parquet").metadata
-    assert said[b"scorer_version"] == str(SCORER_VERSION).encode()
-    assert b"OpenStreetMap" in said[b"attribution"]
+    record = pq.read_schema(out / "boards" / "mine" / "leaderboard.parquet").metadata
+    assert record[b"scorer_version"] == str(SCORER_VERSION).encode()
+    assert b"OpenStreetMap" in record[b"attribution"]
     read = pd.read_parquet(out / "boards" / "mine" / "leaderboard.parquet")
     assert read.attrs["attribution"] == about.attribution
     assert read.attrs["scorer_version"] == str(SCORER_VERSION)
@@ -305,11 +305,11 @@ def test_what_a_rejector_remarks_of_its_fits_is_told_and_kept(out, tmp_path, spl
     submission(out, tmp_path / "mine.parquet")
     rejectors = ["sasgeo_bench.sasgeo.rejectors:SasgeoLogistic", f"{__name__}:Doubt"]
     board, lines = told_by(out, tmp_path / "mine.parquet", rejectors=rejectors, split=split)
-    said = [line for line in lines if "ranked by margin" in line]
-    assert said == list(board.board.about.remarks)
-    assert said[0].startswith("sasgeo_logistic on mine: 0 of ")  # the answers are right, all of them
-    assert said[0].endswith(" judged so)")
-    assert read_board_manifest(out / "boards" / "mine").remarks == said
+    given = [line for line in lines if "ranked by margin" in line]
+    assert given == list(board.board.about.remarks)
+    assert given[0].startswith("sasgeo_logistic on mine: 0 of ")  # the answers are right, all of them
+    assert given[0].endswith(" judged so)")
+    assert read_board_manifest(out / "boards" / "mine").remarks == given
 
 
 def test_protection_levels_are_counted_where_answers_tell_them(out, tmp_path, split):
@@ -317,9 +317,9 @@ def test_protection_levels_are_counted_where_answers_tell_them(out, tmp_path, sp
     submission(out, tmp_path / "mine.parquet", change=lambda row, _: replace(row, diagnostics=levels))
     board = board_of(out, tmp_path / "mine.parquet", split=split)
     assert set(board.board.protection["method"]) == {"gauss", "conformal"}
-    told = board.board.protection[board.board.protection["method"] == "gauss"]
-    assert (told["n"] > 0).all()
-    assert (told["misleading"] == 0.0).all()  # the submission knows the truth
+    given = board.board.protection[board.board.protection["method"] == "gauss"]
+    assert (given["n"] > 0).all()
+    assert (given["misleading"] == 0.0).all()  # the submission knows the truth
     folder = out / "boards" / "mine"
     assert pq.read_table(folder / "protection.parquet").num_rows == len(board.board.protection)
     assert len(pd.read_csv(folder / "protection.csv")) == len(board.board.protection)
@@ -349,13 +349,13 @@ def test_the_own_word_of_a_matcher_stands_beside_its_rejectors_and_needs_no_spli
 def test_what_was_sent_and_what_maps_take_is_told(out, tmp_path):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, out / "runs", tmp_path / "mine.parquet")
-    told = board.board.leaderboard.set_index(["matcher", "metric"])["value"]
+    given = board.board.leaderboard.set_index(["matcher", "metric"])["value"]
     sizes = [
         size for town in TOWNS for size in task_files.Task.open(out / "tasks" / "clean" / town).view_bytes().values()
     ]
     fixes = int(board.scores["mine"]["is_answered"].sum())
-    assert told["mine", "observation_per_fix"] == pytest.approx(sum(sizes) / 1e3 / fixes)
-    assert told["oracle_pose", "map_per_km2"] > 0
+    assert given["mine", "observation_per_fix"] == pytest.approx(sum(sizes) / 1e3 / fixes)
+    assert given["oracle_pose", "map_per_km2"] > 0
     shutil.rmtree(out / "regions")  # scores need no map
     again = board_of(out).board.leaderboard.set_index(["matcher", "metric"])["value"]
     assert math.isnan(again["oracle_pose", "map_per_km2"])
@@ -452,8 +452,8 @@ def test_rows_that_a_board_has_no_more_are_told(out, tmp_path):
     _, first = told_by(out, out / "runs", tmp_path / "mine.parquet", board=board)
     _, second = told_by(out, out / "runs", board=board)
     _, third = told_by(out, out / "runs", board=board)
-    said = f"{board} had rows of mine, which this board has not; their answers are where they were"
-    assert [said in lines for lines in (first, second, third)] == [False, True, False]
+    message = f"{board} had rows of mine, which this board has not; their answers are where they were"
+    assert [message in lines for lines in (first, second, third)] == [False, True, False]
     (board / "site").mkdir()
     (board / "site" / "site.json").write_text('{"files": []}', encoding="utf-8")
     _, fourth = told_by(out, out / "runs", board=board)
@@ -603,9 +603,9 @@ def test_a_region_that_is_left_out_is_as_if_it_had_never_been_asked(out):
     board, lines = told_by(out, out / "runs", without=[TOWNS[1]])
     pd.testing.assert_frame_equal(alone.board.leaderboard, board.board.leaderboard)
     assert not any("left out" in line for line in lines)
-    said = json.loads((out / "boards" / "mine" / "board.json").read_text())
-    assert said["without"] == [TOWNS[1]]
-    assert [task["region"] for task in said["tasks"]] == [TOWNS[0]]
+    record = json.loads((out / "boards" / "mine" / "board.json").read_text())
+    assert record["without"] == [TOWNS[1]]
+    assert [task["region"] for task in record["tasks"]] == [TOWNS[0]]
 
 
 def test_what_cannot_be_left_out_is_told(out, tmp_path):
@@ -640,12 +640,12 @@ def test_answers_without_their_run_are_named_and_cost_themselves_alone(out, tmp_
     run.unlink()
     with pytest.raises(StoreError, match=r"holds answers and no run.json: run the matcher again, they are kept"):
         find_entries([out / "runs"])
-    told = []
+    lines = []
     failures = Failures(tmp_path / "failures.log")
-    with reporting(told.append):
+    with reporting(lines.append):
         (entry,) = find_entries([out / "runs"], failures=failures)
     assert (entry.name, len(entry.sources)) == ("oracle_pose", len(TOWNS) - 1)
-    assert str(run.parent) in told[0]
+    assert str(run.parent) in lines[0]
 
 
 def test_what_is_named_twice_counts_once(out, tmp_path):
@@ -713,11 +713,11 @@ def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):
     with pytest.raises(SystemExit) as left:
         cli.main()
     assert left.value.code == 0
-    told = capsys.readouterr()
-    assert told.out.splitlines()[-1] == str(out / "boards" / "mine")
-    assert re.search(r"oracle_pose  1\.000 \[0\.\d\d, 1\.00\] \(control\)", told.out)
-    assert "fewer than 36 in 12" in told.err
-    assert sorted(path.name for path in Path(told.out.splitlines()[-1]).iterdir()) == [
+    printed = capsys.readouterr()
+    assert printed.out.splitlines()[-1] == str(out / "boards" / "mine")
+    assert re.search(r"oracle_pose  1\.000 \[0\.\d\d, 1\.00\] \(control\)", printed.out)
+    assert "fewer than 36 in 12" in printed.err
+    assert sorted(path.name for path in Path(printed.out.splitlines()[-1]).iterdir()) == [
         "acceptance.parquet",
         "board.json",
         "contrasts.parquet",
@@ -750,10 +750,10 @@ def test_a_control_that_fails_is_told_first_and_ends_with_its_own_status(out, mo
     with pytest.raises(SystemExit) as left:
         cli.main()
     assert left.value.code == 3
-    told = capsys.readouterr()
-    assert "CONTROLS FAILED, 1 of 1: do not trust this board." in told.err
-    assert verdict.to_text() in told.err
-    assert told.out.splitlines()[-1] == str(out / "boards" / "mine")  # written all the same
+    printed = capsys.readouterr()
+    assert "CONTROLS FAILED, 1 of 1: do not trust this board." in printed.err
+    assert verdict.to_text() in printed.err
+    assert printed.out.splitlines()[-1] == str(out / "boards" / "mine")  # written all the same
     text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
     assert text.index("CONTROLS FAILED") < text.index("## ")
 
@@ -806,8 +806,8 @@ def rewrite(path, column, value):
 @pytest.fixture
 def both(out, tmp_path):
     """A good file beside a bad one; a contrast of the two."""
-    for name, told in (("good", 1.0), ("bad", 2.0)):
-        told_of = {"told": told}
+    for name, each in (("good", 1.0), ("bad", 2.0)):
+        told_of = {"told": each}
         submission(out, tmp_path / f"{name}.parquet", change=lambda row, _, of=told_of: replace(row, diagnostics=of))
     return [tmp_path / "good.parquet", tmp_path / "bad.parquet"]
 
@@ -973,9 +973,9 @@ def test_a_rejector_that_fails_with_one_judges_the_others(out, both, split):
 def test_the_program_says_who_failed_and_ends_with_a_status_of_its_own(out, both, program):
     rewrite(both[1], "latency_s", math.inf)
     words = ("--out", out, "--name", "mine", "--draws", "200", "--no-cases")
-    code, told, err = program("score", *(word for path in both for word in ("--predictions", path)), *words)
+    code, printed, err = program("score", *(word for path in both for word in ("--predictions", path)), *words)
     assert code == CONTESTANT_FAILED
-    assert told.splitlines()[-1] == str(out / "boards" / "mine")
+    assert printed.splitlines()[-1] == str(out / "boards" / "mine")
     assert "Traceback" not in err
     (line,) = [line for line in err.splitlines() if line.startswith("failed, and so not on the board: bad: ")]
     assert "latency_s is inf" in line

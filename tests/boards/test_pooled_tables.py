@@ -42,9 +42,16 @@ def answered(errors_m, **changes):
 
 
 def truth_of(name):
-    said = {"candidate": -1, "pair_id": "p", "role": "stress", "kind": "U1", "strength": 0.3, "strength_unit": "share"}
-    said |= {"unknown_share": 0.0, "changed_share": 0.0, "feature_density": 0.1, "alias_index": 0.2, "scene": "urban"}
-    return Truth(query_id=name, is_present=True, pose=place(0), block="b", **said)
+    row = {
+        "candidate": -1,
+        "pair_id": "p",
+        "role": "stress",
+        "kind": "U1",
+        "strength": 0.3,
+        "strength_unit": "share",
+    }
+    row |= {"unknown_share": 0.0, "changed_share": 0.0, "feature_density": 0.1, "alias_index": 0.2, "scene": "urban"}
+    return Truth(query_id=name, is_present=True, pose=place(0), block="b", **row)
 
 
 @pytest.fixture(scope="module")
@@ -71,10 +78,10 @@ def test_recall_of_the_first_pose_is_the_share_within_25_m_and_it_never_falls(li
     tables, answers, truths = listed
     rows = recall_frame(tables, answers, truths, ["one", "two"])
     board = leaderboard(tables, draws=100)
-    said = board[(board["metric"] == "within_25m") & (board["stratum"] == "stress")].set_index("matcher")["value"]
+    result = board[(board["metric"] == "within_25m") & (board["stratum"] == "stress")].set_index("matcher")["value"]
     for name, mine in rows.groupby("matcher"):
         assert mine["k"].tolist() == [1, 2, 3]
-        assert mine["value"].iloc[0] == pytest.approx(said[name])
+        assert mine["value"].iloc[0] == pytest.approx(result[name])
         assert mine["value"].is_monotonic_increasing
         assert (mine["lo"] <= mine["value"]).all()
     one = rows[(rows["matcher"] == "one") & (rows["k"] == 3)]["value"].iloc[0]
@@ -87,8 +94,8 @@ def test_recall_of_retrieval_is_that_of_the_board(listed):
     right = scores(np.zeros(COUNT), track="retrieval").assign(above=AT % 3, tied=1, right=1, pool=20)
     rows = recall_frame({"one": right}, answers, truths, ["one"])
     board = leaderboard({"one": right}, draws=100)
-    said = board[(board["metric"] == "recall_1") & (board["stratum"] == "stress")]["value"].iloc[0]
-    assert rows["value"].tolist() == pytest.approx([said, 2 / 3, 1.0])
+    result = board[(board["metric"] == "recall_1") & (board["stratum"] == "stress")]["value"].iloc[0]
+    assert rows["value"].tolist() == pytest.approx([result, 2 / 3, 1.0])
 
 
 def test_answers_of_one_pose_have_no_curve_of_recall(listed):
@@ -104,10 +111,10 @@ def test_a_curve_of_errors_passes_through_the_figure_of_the_board_and_ends_below
     tables, _, _ = listed
     board = leaderboard(tables, draws=100)
     rows = errors_frame(tables, board, ["one", "two"])
-    said = board[(board["metric"] == "within_25m") & (board["stratum"] == "stress")].set_index("matcher")
+    result = board[(board["metric"] == "within_25m") & (board["stratum"] == "stress")].set_index("matcher")
     for name, mine in rows.groupby("matcher"):
         (at,) = mine[mine["radius_m"] == 25.0].to_dict("records")
-        assert (at["value"], at["lo"], at["hi"]) == tuple(said.loc[name, ["value", "lo", "hi"]])
+        assert (at["value"], at["lo"], at["hi"]) == tuple(result.loc[name, ["value", "lo", "hi"]])
         assert mine["value"].is_monotonic_increasing
     two = rows[rows["matcher"] == "two"]
     assert two["value"].iloc[-1] == pytest.approx(np.mean(AT % 4 == 0))  # what is not answered is never near
@@ -121,8 +128,8 @@ def test_a_curve_of_costs_passes_through_the_figures_of_the_board():
     board = FIGURE_SCHEMA.frame(list(integrity_rows("one", "own", judged["one", "own"])))
     rows = cost_frame(judged, {("one", "own")}, ["one"])
     for ratio in COST_RATIOS:
-        said = board[(board["metric"] == f"cost_{ratio:g}_place") & (board["suite"] == "all suites")]["value"].iloc[0]
-        assert rows.loc[rows["ratio"] == ratio, "cost"].tolist() == [pytest.approx(said)]
+        result = board[(board["metric"] == f"cost_{ratio:g}_place") & (board["suite"] == "all suites")]["value"].iloc[0]
+        assert rows.loc[rows["ratio"] == ratio, "cost"].tolist() == [pytest.approx(result)]
     at = rows[rows["ratio"] == 5.0].iloc[0]
     assert (at["withhold_all"], at["accept_all"]) == (1.0, pytest.approx(5.0 / 3.0))
     assert cost_frame(judged, set(), ["one"]).empty  # what gives no probabilities has no such cost
@@ -172,11 +179,11 @@ def test_prices_are_those_of_the_board_on_the_queries_that_all_were_asked(tmp_pa
     one = answered(np.where(AT % 3 == 0, 4.0, 300.0))
     more = answered(np.full(COUNT, 4.0)).assign(suite="clean", query_id=[f"x{at}" for at in AT])
     tables = {"one": pd.concat([one, more], ignore_index=True), "two": one}
-    said = {"rejector": "", "suite": "all suites", "stratum": "all", "prior_group": "all"}
+    values = {"rejector": "", "suite": "all suites", "stratum": "all", "prior_group": "all"}
     costs = [
-        {"matcher": "one", "track": "localization", "metric": "latency_p50", "value": 0.5, **said},
-        {"matcher": "one", "track": "localization", "metric": "latency_p95", "value": np.inf, **said},
-        {"matcher": "one", "track": "all", "metric": "map_per_km2", "value": 40.0, **said},
+        {"matcher": "one", "track": "localization", "metric": "latency_p50", "value": 0.5, **values},
+        {"matcher": "one", "track": "localization", "metric": "latency_p95", "value": np.inf, **values},
+        {"matcher": "one", "track": "all", "metric": "map_per_km2", "value": 40.0, **values},
     ]
     rows = price_frame(pd.DataFrame(costs), tables, ["one", "two"])
     assert rows["suites"].tolist() == ["occlusion"] * 2  # `one` alone was asked the easy ones

@@ -252,17 +252,17 @@ def test_a_private_board_of_something_else_is_refused(made, tmp_path, changes, w
 
 @has_landlock
 def test_only_the_same_code_shut_in_on_128_bits_vouches_for_a_row(made, tmp_path):
-    said = entry_of(made / "out" / "private" / "boards" / "little").model_dump()
+    record = entry_of(made / "out" / "private" / "boards" / "little").model_dump()
     seed = {"commitment": SEED.commitment, "bits": 80}
     for number, (changes, words) in enumerate(
         (
             ({"private_seed": seed}, "the private seed has 80 bits, 128 are needed"),
             (
-                {"entries": [said | {"hash": "other"}]},
+                {"entries": [record | {"hash": "other"}]},
                 "this version, code and settings are not on the private board",
             ),
             (
-                {"entries": [said | {"isolation": {"truth": "not in its root | trusted code, not shut in"}}]},
+                {"entries": [record | {"isolation": {"truth": "not in its root | trusted code, not shut in"}}]},
                 "on the private seed its truths were not kept from it (not in its root | trusted code, not shut in)",
             ),
         )

@@ -142,10 +142,10 @@ def test_a_site_has_every_page_and_each_leads_only_to_what_is_there(site, pages)
     assert pages.keys() >= {"matcher-graph.html", "matcher-script-alert-1-script.html"}
     led_to = set()
     for name, page in pages.items():
-        ids = [said["id"] for _, said in page.found if "id" in said]
+        ids = [each["id"] for _, each in page.found if "id" in each]
         assert len(ids) == len(set(ids)), name
-        for tag, said in page.found:
-            target = said.get("href") or said.get("src")
+        for tag, each in page.found:
+            target = each.get("href") or each.get("src")
             if target is None or target == "data:,":
                 continue
             if "://" in target:
@@ -157,9 +157,9 @@ def test_a_site_has_every_page_and_each_leads_only_to_what_is_there(site, pages)
             assert not file or (site / file).is_file(), (name, target)
             if part:
                 there = pages[file or name]
-                assert part in {said["id"] for _, said in there.found if "id" in said}, (name, target)
+                assert part in {each["id"] for _, each in there.found if "id" in each}, (name, target)
             led_to.add(file or name)
-    led_to |= {said["data-file"] for _, said in pages["map.html"].found if "data-file" in said}
+    led_to |= {each["data-file"] for _, each in pages["map.html"].found if "data-file" in each}
     assert contents(site).keys() - led_to - {"site.json"} == set()
 
 
@@ -170,14 +170,14 @@ def test_every_page_is_well_formed_and_says_whose_data_it_is(site, pages):
         assert page.found[0] == ("html", {"lang": "en"})
         assert "OpenStreetMap contributors" in page.said("footer")[0]
         assert "ODbL" in page.said("footer")[0]
-        for tag, said in page.found:
-            assert tag != "img" or said.get("alt"), name
-            assert not any(one.startswith("on") for one in said), (name, said)
+        for tag, each in page.found:
+            assert tag != "img" or each.get("alt"), name
+            assert not any(one.startswith("on") for one in each), (name, each)
     for path in site.rglob("*.svg"):
         assert "(c) OpenStreetMap contributors, ODbL" in path.read_text(encoding="utf-8"), path
     for name in ("suite-real-age.html", "failures.html", "regions.html"):
-        credits_ = [said for tag, said in pages[name].found if said.get("class") == "credit"]
-        pictures = [said for tag, said in pages[name].found if tag == "img" and said["src"].startswith("pictures/")]
+        credits_ = [each for tag, each in pages[name].found if each.get("class") == "credit"]
+        pictures = [each for tag, each in pages[name].found if tag == "img" and each["src"].startswith("pictures/")]
         assert len(credits_) == len(pictures) > 0
 
 
@@ -189,9 +189,9 @@ def test_hostile_names_and_cards_with_markup_are_shown_as_text(pages):
     assert MARKUP in " ".join(pages["failures.html"].said("dl"))
     for name, page in pages.items():
         files = ["site.js", "leaflet.js", "map.js"] if name == "map.html" else ["site.js"]
-        scripts = [said for tag, said in page.found if tag == "script"]
+        scripts = [each for tag, each in page.found if tag == "script"]
         assert scripts == [{"src": file, "defer": None} for file in files], name
-        assert not [said for tag, said in page.found if tag == "img" and said["src"] == "x"]
+        assert not [each for tag, each in page.found if tag == "img" and each["src"] == "x"]
 
 
 def test_the_board_is_what_its_tables_say_read_by_meaning(pages):
@@ -226,15 +226,15 @@ def test_the_board_is_what_its_tables_say_read_by_meaning(pages):
 def test_every_column_of_every_table_says_what_it_means_to_a_keyboard_too(pages):
     for name, page in pages.items():
         tips = {
-            said["id"]: text
-            for (_, said), (_, text) in zip(page.found, page.texts, strict=True)
-            if said.get("role") == "tooltip"
+            each["id"]: text
+            for (_, each), (_, text) in zip(page.found, page.texts, strict=True)
+            if each.get("role") == "tooltip"
         }
-        buttons = [said for tag, said in page.found if tag == "button" and said.get("id") not in {"previous", "next"}]
-        for said in buttons:
-            assert len(tips[said["aria-describedby"]]) > 20, name
+        buttons = [each for tag, each in page.found if tag == "button" and each.get("id") not in {"previous", "next"}]
+        for each in buttons:
+            assert len(tips[each["aria-describedby"]]) > 20, name
         assert not any("no meaning is written down" in text for text in tips.values()), name
-        assert len(buttons) == len([1 for tag, said in page.found if tag == "th" and "aria-sort" in said])
+        assert len(buttons) == len([1 for tag, each in page.found if tag == "th" and "aria-sort" in each])
 
 
 def test_no_figure_stands_without_interval_and_n(pages):
@@ -261,7 +261,7 @@ def test_a_suite_says_what_is_done_and_a_matcher_what_it_cannot(pages):
 def test_the_failures_lead_from_one_to_the_next_without_scripts(pages):
     titles = pages["failures.html"].said("h3")
     assert titles == ["1 of 3: aliased, graph", "2 of 3: occluded, graph", "3 of 3: odd one, graph"]
-    turns = [said["href"] for _, said in pages["failures.html"].found if said.get("rel") in ("next", "prev")]
+    turns = [each["href"] for _, each in pages["failures.html"].found if each.get("rel") in ("next", "prev")]
     assert turns == ["#case-2", "#case-1", "#case-3", "#case-2"]
 
 
@@ -337,7 +337,7 @@ def test_a_failed_control_is_told_where_it_cannot_be_overlooked(tmp_path):
         )
         page = read(publish(tmp_path / name).folder)["index.html"]
         parts = zip(page.found, page.texts, strict=True)
-        kinds = ((said.get("class"), text) for (_, said), (_, text) in parts)
+        kinds = ((each.get("class"), text) for (_, each), (_, text) in parts)
         return next((kind, text) for kind, text in kinds if kind in {"held", "doubtful", "failed"})
 
     kind, text = box_of("mine", "random")
@@ -354,10 +354,10 @@ def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path)
     tasks = [{"suite": "nobodys-suite", "region": "my-town"}]
     made_by = {"pipeline": {"id": "x", "sha256": "y"}, "title": "A title of mine"}
     put_board(tmp_path / "mine", table=table, tasks=tasks, entries=[entry_of("unasked")], **made_by)
-    told = []
-    with reporting(told.append):
+    lines = []
+    with reporting(lines.append):
         pages = read(publish(tmp_path / "mine").folder)
-    assert told == ["not on the map of places, for no region of that name ships: my-town"]
+    assert lines == ["not on the map of places, for no region of that name ships: my-town"]
     assert "This version knows no suite of that name" in " ".join(pages["suite-nobodys-suite.html"].said("p"))
     assert "nobodys-suite: localization, my-group" in pages["index.html"].said("h3")
     assert "It has no figure on this board." in pages["matcher-unasked.html"].said("p")
@@ -562,16 +562,16 @@ def test_a_figure_that_is_no_plain_svg_is_refused(own, mistake, text, fault):
 def test_files_of_ones_own_in_an_older_site_are_never_lost(few, mistake, tmp_path):
     target = tmp_path / "public"
     publish(few, target)
-    said = json.loads((target / "site.json").read_text(encoding="utf-8"))
-    assert {*said["files"], "site.json"} == contents(target).keys()
+    record = json.loads((target / "site.json").read_text(encoding="utf-8"))
+    assert {*record["files"], "site.json"} == contents(target).keys()
     publish(few, target)
     (target / ".git").mkdir()
     (target / ".git" / "HEAD").touch()
     (target / "CNAME").touch()
     lost = "2 files (.git/HEAD, CNAME) that would be lost and are not part of a site: move that away"
     assert lost in mistake("publish", "--board", few, "--into", target)
-    del said["files"]
-    (target / "site.json").write_text(json.dumps(said), encoding="utf-8")
+    del record["files"]
+    (target / "site.json").write_text(json.dumps(record), encoding="utf-8")
     assert lost in mistake("publish", "--board", few, "--into", target)
     shutil.rmtree(target / ".git")
     (target / "CNAME").unlink()
@@ -582,10 +582,10 @@ def test_files_of_ones_own_in_an_older_site_are_never_lost(few, mistake, tmp_pat
     with pytest.raises(StoreError, match=r"1 file \(figures/notes.txt\) that would be lost"):
         check_board(few, scorer_version=json.loads((few / "board.json").read_text(encoding="utf-8"))["scorer_version"])
     (few / "figures" / "notes.txt").unlink()
-    said = {"files": ["thesis.tex"]}  # a file of another program that has the name
+    record = {"files": ["thesis.tex"]}  # a file of another program that has the name
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.tex").touch()
-    (tmp_path / "thesis" / "site.json").write_text(json.dumps(said), encoding="utf-8")
+    (tmp_path / "thesis" / "site.json").write_text(json.dumps(record), encoding="utf-8")
     assert "1 file (thesis.tex) that would be lost" in mistake("publish", "--board", few, "--into", tmp_path / "thesis")
     with pytest.raises(StoreError, match=r"1 file \(CNAME\) that would be lost"):
         check_board(few, scorer_version=json.loads((few / "board.json").read_text(encoding="utf-8"))["scorer_version"])

@@ -29,10 +29,10 @@ def lines_of_truth(chart):
 
 def test_the_truth_is_drawn_only_where_it_is_given(tiny):
     query, truth = first_of(tiny, "localization")
-    without, told = (sgb.plot_query(query, tiny.region, one) for one in (None, truth))
+    without, given = (sgb.plot_query(query, tiny.region, one) for one in (None, truth))
     assert titles(without) == ["view", "map"]
-    assert titles(told) == ["view", "map at the true place", "map"]
-    assert len(lines_of_truth(told.axes[-1])) > len(lines_of_truth(without.axes[-1]))
+    assert titles(given) == ["view", "map at the true place", "map"]
+    assert len(lines_of_truth(given.axes[-1])) > len(lines_of_truth(without.axes[-1]))
 
 
 def test_the_disc_of_the_prior_lies_on_the_map_around_its_middle(tiny):

@@ -33,11 +33,11 @@ def test_a_gain_is_over_the_control_of_the_same_site_and_views_without_one_are_l
     assert related_work.cell(found.iloc[:0]) == "-"
 
 
-@pytest.mark.parametrize(("hit", "said"), [(0.0, "0, +0 (+0 to +49)"), (1.0, "100, +0 (-49 to +0)")])
-def test_no_difference_on_few_views_leaves_open_what_can_be(hit, said):
+@pytest.mark.parametrize(("hit", "expected"), [(0.0, "0, +0 (+0 to +49)"), (1.0, "100, +0 (-49 to +0)")])
+def test_no_difference_on_few_views_leaves_open_what_can_be(hit, expected):
     rows = [view(role, hit, pair=pair) for pair in "abcd" for role in ("stress", "control")]
     found = related_work.views_of(pd.DataFrame(rows), "m", GRAPH)
-    assert related_work.cell(found) == said  # Wilson's: 0 to 49 of 4
+    assert related_work.cell(found) == expected  # Wilson's: 0 to 49 of 4
 
 
 def test_the_own_confidence_of_a_system_comes_before_the_margin():
@@ -49,8 +49,8 @@ def test_the_own_confidence_of_a_system_comes_before_the_margin():
             for m, r, v in rows
         ]
     ).astype({"value": float, "lo": float, "hi": float})
-    said = [related_work.figure(table, name, "auroc", related_work.REJECTORS) for name in "mno"]
-    assert said == ["90 (80 to 95)", "70 (60 to 75)", "-"]
+    lines = [related_work.figure(table, name, "auroc", related_work.REJECTORS) for name in "mno"]
+    assert lines == ["90 (80 to 95)", "70 (60 to 75)", "-"]
 
 
 @pytest.mark.parametrize(("board", "system", "column"), [("claims", "sasgeo", 2), ("flights", "swapf", 4)])
@@ -116,7 +116,7 @@ def damaged(folder, table, change):
 
 
 @pytest.mark.parametrize(
-    ("table", "change", "said"),
+    ("table", "change", "expected"),
     [
         ("scores", lambda rows: rows.drop(columns="strength"), "scores.parquet has no column 'strength'"),
         ("scores", lambda rows: rows.drop(columns="role"), "scores.parquet has no column 'role'"),
@@ -137,12 +137,12 @@ def damaged(folder, table, change):
         ("leaderboard", lambda rows: pd.concat((rows, rows)), "leaderboard.parquet says one figure twice"),
     ],
 )
-def test_a_damaged_table_is_told_in_one_line(table, change, said, tmp_path, capsys):
+def test_a_damaged_table_is_told_in_one_line(table, change, expected, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         related_work.main([str(damaged(tmp_path / "board", table, change))])
     assert stop.value.code == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert said in last
+    assert expected in last
     assert last.endswith("score it again")
 
 

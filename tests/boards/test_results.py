@@ -35,8 +35,8 @@ def test_there_are_results_of_the_registered_experiment():
 def test_results_are_of_the_pipeline_as_it_is_registered(name):
     spec = read_pipeline_file(find_pipeline_file(name))
     assert stored_settings([RESULTS / name]).pipeline == spec.identity
-    said = json.loads((RESULTS / name / "board.json").read_text(encoding="utf-8"))
-    assert {entry["name"] for entry in said["entries"]} >= set(spec.matchers) - {"oracle_pose"}
+    record = json.loads((RESULTS / name / "board.json").read_text(encoding="utf-8"))
+    assert {entry["name"] for entry in record["entries"]} >= set(spec.matchers) - {"oracle_pose"}
 
 
 def test_results_are_small():
@@ -106,9 +106,9 @@ def test_some_pages_have_programs():
 @pytest.mark.parametrize("page", [page for page in PAGES if PROGRAM.search(TEXTS[page])], ids=lambda path: path.stem)
 def test_every_program_on_the_pages_prints_what_they_say(page, monkeypatch, capsys):
     monkeypatch.chdir(RESULTS.parents[1])
-    for program, said in PROGRAM.findall(TEXTS[page]):
+    for program, each in PROGRAM.findall(TEXTS[page]):
         exec(program, {})  # noqa: S102 - of our own page
-        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == said.splitlines()
+        assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == each.splitlines()
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def test_the_verdicts_that_the_pages_put_into_words_are_those_of_the_boards():
     outcomes = {
         board: pd.read_parquet(RESULTS / board / "contrasts.parquet").set_index("name")["outcome"] for board in BOARDS
     }
-    said = {
+    values = {
         "modules": {
             **dict.fromkeys(("graph-junctions", "graph-instances"), "decided"),
             **dict.fromkeys(("graph-levels", "graph-warp", "learned-age", "prior-age", "prior-lure"), "not decided"),
@@ -210,5 +210,5 @@ def test_the_verdicts_that_the_pages_put_into_words_are_those_of_the_boards():
             "diffusion": "null",
         },
     }
-    for board, words in said.items():
+    for board, words in values.items():
         assert outcomes[board][list(words)].to_dict() == words

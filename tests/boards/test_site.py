@@ -73,7 +73,7 @@ KEY = ("real-age", "localization", "r500-weak-s3")
 
 def source(table=None, findings=(), entries=(), **changes):
     board = many_rows(6) if table is None else table
-    about = about_of([entry_of(name, **said) for name, said in dict(entries).items()])
+    about = about_of([entry_of(name, **each) for name, each in dict(entries).items()])
     tables = {name: changes.pop(name) for name in TABLES if name in changes}
     made = Board(
         folder=Path("mine"), about=about, leaderboard=board, **{"contrasts": CONTRAST_SCHEMA.frame(findings), **tables}
@@ -180,8 +180,8 @@ def test_prior_groups_and_tracks_are_never_in_one_table():
 
 
 def test_who_is_set_apart_stands_in_a_table_below_with_the_reason():
-    said = {"matcher-000": {"set_apart": "trained on the test place vaduz"}, "matcher-001": {}, "elsewhere": {}}
-    (section,) = sections_of(book_of(source(entries=said)))
+    values = {"matcher-000": {"set_apart": "trained on the test place vaduz"}, "matcher-001": {}, "elsewhere": {}}
+    (section,) = sections_of(book_of(source(entries=values)))
     assert "matcher-000" not in [row.cells[0].text for row in section.table.rows]
     assert [row.cells[0].text for row in section.apart.rows] == ["matcher-000"]
     assert section.apart.notes == ("matcher-000: trained on the test place vaduz.",)
@@ -222,21 +222,21 @@ def test_a_matcher_that_cannot_has_words_and_no_figure():
     ],
 )
 def test_a_contrast_is_told_in_words_with_figure_interval_p_and_counts(changes, outcome, headline, because):
-    (told,) = contrasts_of(source(findings=[replace(FINDING, **changes)]))
-    assert (told.outcome, told.headline, told.because) == (outcome, headline, because)
-    if told.outcome == "null":
-        assert told.facts[0] == "adjusted p 1.000 (Holm, 1 contrast)"
+    (result,) = contrasts_of(source(findings=[replace(FINDING, **changes)]))
+    assert (result.outcome, result.headline, result.because) == (outcome, headline, because)
+    if result.outcome == "null":
+        assert result.facts[0] == "adjusted p 1.000 (Holm, 1 contrast)"
     elif "n" not in changes:
-        assert told.sentence.startswith("Difference 0.100 [0.040, 0.160] in the share of queries that are right")
-        assert told.facts[:3] == ("adjusted p 0.020 (Holm, 1 contrast)", "n = 120 queries", "40 blocks")
+        assert result.sentence.startswith("Difference 0.100 [0.040, 0.160] in the share of queries that are right")
+        assert result.facts[:3] == ("adjusted p 0.020 (Holm, 1 contrast)", "n = 120 queries", "40 blocks")
     else:
-        assert told.sentence == "No query of this board counts for it."
+        assert result.sentence == "No query of this board counts for it."
 
 
 def test_what_is_decided_stands_first():
     changes = ({"places": 2}, {"lo": -0.01, "hi": 0.02, "p_holm": 1.0}, {"least": 0.2}, {})
     findings = [replace(FINDING, name=f"c{at}", **each) for at, each in enumerate(changes)]
-    assert [told.name for told in contrasts_of(source(findings=findings))] == ["c3", "c2", "c1", "c0"]
+    assert [entry.name for entry in contrasts_of(source(findings=findings))] == ["c3", "c2", "c1", "c0"]
 
 
 def test_places_lie_in_the_middle_of_their_regions_and_unknown_ones_nowhere():
@@ -323,8 +323,8 @@ def test_whether_the_risk_was_kept_is_said_by_its_interval_and_where_it_was_not_
     (table,) = risk_tables(FIGURE_SCHEMA.frame(rows))
     assert table.rows[0].cells[4].text == "open"
     (table,) = risk_tables_by_suite(FIGURE_SCHEMA.frame(rows))
-    said = {one.name: text_of(cell) for one, cell in zip(table.columns, table.rows[0].cells, strict=True)}
-    assert said | {"50 % of places absent": "0.200", "30 % of places absent": "-", "twins": "0.300"} == said
+    values = {one.name: text_of(cell) for one, cell in zip(table.columns, table.rows[0].cells, strict=True)}
+    assert values | {"50 % of places absent": "0.200", "30 % of places absent": "-", "twins": "0.300"} == values
 
 
 def test_words_of_files_are_plain():
@@ -338,21 +338,21 @@ def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
         Falsifier(contrast="other", suite="all", kind="all", finding=FINDING),
     ]
     gained = replace(FINDING, gains_without_stress=True)
-    (told,) = contrasts_of(source(findings=[gained], falsifiers=FALSIFIER_SCHEMA.frame(rows)))
-    assert told.unstressed.startswith("Without the stress, where they should not differ: ")
-    assert "(n = 80, 9 blocks). What it gains there is not owed" in told.unstressed
-    assert told.outcome == "cause open"
+    (result,) = contrasts_of(source(findings=[gained], falsifiers=FALSIFIER_SCHEMA.frame(rows)))
+    assert result.unstressed.startswith("Without the stress, where they should not differ: ")
+    assert "(n = 80, 9 blocks). What it gains there is not owed" in result.unstressed
+    assert result.outcome == "cause open"
     (silent,) = contrasts_of(source(findings=[FINDING]))
     assert silent.unstressed == ""
     none = replace(rows[0], finding=replace(FINDING, lo=-0.1))
-    (told,) = contrasts_of(source(findings=[FINDING], falsifiers=FALSIFIER_SCHEMA.frame([none])))
-    assert "no gain shown" in told.unstressed
-    assert "not owed" not in told.unstressed
-    assert told.outcome == "decided"
+    (result,) = contrasts_of(source(findings=[FINDING], falsifiers=FALSIFIER_SCHEMA.frame([none])))
+    assert "no gain shown" in result.unstressed
+    assert "not owed" not in result.unstressed
+    assert result.outcome == "decided"
 
 
 @pytest.mark.parametrize(
-    ("said", "words"),
+    ("expected", "words"),
     [
         ("none", "no place that its card names"),
         ([], "no place that its card names"),
@@ -360,8 +360,8 @@ def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
         ({"a": ["munich"], "b": "none"}, "half a: munich; half b: no place that its card names"),
     ],
 )
-def test_places_that_a_card_names_are_words_and_not_letters(said, words):
-    card = card_of("graph", trained_on=said)
+def test_places_that_a_card_names_are_words_and_not_letters(expected, words):
+    card = card_of("graph", trained_on=expected)
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"card": card}})
     (page,) = matchers_of(given, book_of(given))
     assert page.trained == words
@@ -420,10 +420,10 @@ def test_a_place_has_its_answers_in_metres_from_the_corner_of_its_map():
     whole = source(answers=answers_of([MARKUP]), pictures=pictures)
     ((place, script),) = place_maps(whole).items()
     assert (place.region, place.queries) == ("vaduz", 3)
-    said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
-    assert said["queries"][0] == ["q0", "real-age", "vaduz@2015-07-27", "S1", 1, 128.0, 100.0, 200.0, 90.0]
-    assert said["answers"] == [[MARKUP, [[0, 0, 100.0, 200.0, 90.0], [1, 1, 400.0, 200.0, 90.0], [2, -1]]]]
-    assert said["cases"] == {"1": 1}
+    record = json.loads(script.partition(", ")[2].removesuffix(");\n"))
+    assert record["queries"][0] == ["q0", "real-age", "vaduz@2015-07-27", "S1", 1, 128.0, 100.0, 200.0, 90.0]
+    assert record["answers"] == [[MARKUP, [[0, 0, 100.0, 200.0, 90.0], [1, 1, 400.0, 200.0, 90.0], [2, -1]]]]
+    assert record["cases"] == {"1": 1}
     assert script.isascii()
     assert place_maps(source(pictures=pictures)) == {}
 
@@ -432,9 +432,9 @@ def test_what_was_not_asked_is_no_failure_on_a_map():
     item = RegionMap(region="vaduz", file="vaduz.png", bounds_m=BOUNDS_M)
     answers = answers_of(["graph"]).assign(status="not applicable", failure="")
     ((_, script),) = place_maps(source(answers=answers, pictures=PicturesManifest(regions=[item]))).items()
-    said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
+    record = json.loads(script.partition(", ")[2].removesuffix(");\n"))
     number = list(pages.OUTCOMES).index("not applicable")
-    assert {row[1] for row in said["answers"][0][1]} == {number}
+    assert {row[1] for row in record["answers"][0][1]} == {number}
     script = (Path(pages.__file__).parent / "templates" / "map.js").read_text(encoding="utf-8")
     assert f"const NOT_ASKED = {number};" in script
     assert len(re.search(r"COLOURS = \[(.*)\]", script)[1].split(",")) == len(pages.OUTCOMES)
@@ -469,10 +469,10 @@ def test_of_many_answers_a_share_is_drawn_those_with_a_picture_first_and_the_pag
     assert place.queries == 300
     assert 40 < place.drawn < 90
     assert len(script) < len(whole) // 3
-    said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
-    assert len(said["queries"]) == place.drawn
-    assert [len(rows) for _, rows in said["answers"]] == [place.drawn, place.drawn]
-    assert said["queries"][int(next(iter(said["cases"])))][0] == "q1-42"
+    record = json.loads(script.partition(", ")[2].removesuffix(");\n"))
+    assert len(record["queries"]) == place.drawn
+    assert [len(rows) for _, rows in record["answers"]] == [place.drawn, place.drawn]
+    assert record["queries"][int(next(iter(record["cases"])))][0] == "q1-42"
     page = site_pages(given)["map.html"]
     assert f"Drawn are {place.drawn} of 300 queries" in page
     assert f"({place.drawn} of 300)" in page
@@ -544,6 +544,6 @@ def test_the_column_of_a_suite_says_what_is_done_and_which_steps_its_figure_pool
 )
 def test_a_contrast_says_who_is_ahead_and_what_its_metric_is(metric, difference, side, sentence):
     finding = replace(FINDING, metric=metric, difference=difference, is_lower_better=metric != "primary")
-    (told,) = contrasts_of(source(findings=[finding]))
-    assert told.side == side
-    assert sentence in told.sentence
+    (result,) = contrasts_of(source(findings=[finding]))
+    assert result.side == side
+    assert sentence in result.sentence

@@ -164,7 +164,7 @@ def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("build-region", "vadus"), "did you mean 'vaduz'"),
         (("build-region", "vadus.toml"), "no region file vadus.toml, did you mean 'vaduz'?"),
@@ -175,12 +175,12 @@ def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
         (("inspect", "vaduz"), "out/regions holds no region 'vaduz': build-region vaduz first"),
     ],
 )
-def test_a_mistake_gets_one_line_and_exit_2(mistake, words, told):
-    assert told in mistake(*words)
+def test_a_mistake_gets_one_line_and_exit_2(mistake, words, expected):
+    assert expected in mistake(*words)
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("inspect", "out", "--rows", "0"), "invalid value for '--rows': "),
         (("inspect", "out", "--row", "1"), "no such option: --row"),
@@ -188,14 +188,14 @@ def test_a_mistake_gets_one_line_and_exit_2(mistake, words, told):
         (("inspct",), "no such command 'inspct'"),
     ],
 )
-def test_a_wrong_word_on_the_command_line_gets_one_line_that_leads_to_the_help(mistake, words, told):
+def test_a_wrong_word_on_the_command_line_gets_one_line_that_leads_to_the_help(mistake, words, expected):
     line = mistake(*words)
-    assert line.startswith(f"sasgeo-bench: {told}")
+    assert line.startswith(f"sasgeo-bench: {expected}")
     assert line.endswith("(see 'sasgeo-bench inspect --help')" if words[0] == "inspect" else "'sasgeo-bench --help')")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "expected"),
     [
         ("cell_size_m = 1.0", "cell_size_m = 0.0", "cell_size_m must lie between"),
         ("cell_size_m", "cell_sise_m", "did you mean 'cell_size_m'"),
@@ -204,10 +204,10 @@ def test_a_wrong_word_on_the_command_line_gets_one_line_that_leads_to_the_help(m
         ("center_lonlat = [11.65, 48.65]", "center_lonlat = [11.65, 88.65]", "84"),
     ],
 )
-def test_a_wrong_region_file_gets_one_line_and_exit_2(mistake, old, new, told, tmp_path):
+def test_a_wrong_region_file_gets_one_line_and_exit_2(mistake, old, new, expected, tmp_path):
     path = small_town(tmp_path)
     path.write_text(path.read_text().replace(old, new))
-    assert told in mistake("build-region", path)
+    assert expected in mistake("build-region", path)
     assert not (tmp_path / "out").exists()
 
 
@@ -216,9 +216,9 @@ def test_a_missing_extract_names_the_file_its_hash_and_where_to_put_it(mistake, 
     own = tmp_path / "own.toml"
     own.write_text("\n".join(line for line in text.splitlines() if not line.startswith("urls")))
     (tmp_path / "mine").mkdir()
-    told = mistake("build-region", own, "--extracts", tmp_path / "mine")
+    given = mistake("build-region", own, "--extracts", tmp_path / "mine")
     for word in ("monaco-2025-02-15.osm.pbf", "72dc9a65600864fa", "mine", "--extracts"):
-        assert word in told
+        assert word in given
     assert "'nowhere' does not exist" in mistake("build-region", own, "--extracts", "nowhere")
 
 

@@ -53,7 +53,7 @@ def test_places_are_put_beside_each_other(program, towns, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("--at", "2014-13-01"), "--at must be a date"),
         (("--at", "2014-01-01"), "got 1 for 2 extracts"),
@@ -63,8 +63,8 @@ def test_places_are_put_beside_each_other(program, towns, tmp_path):
         (("--extract", "none.osm.pbf"), "no extract at none.osm.pbf"),
     ],
 )
-def test_a_mistake_gets_one_line_and_exit_2(words, told, mistake, towns, tmp_path):
-    assert told in mistake("measure-ageing", *extracts(towns[:2]), *words)
+def test_a_mistake_gets_one_line_and_exit_2(words, expected, mistake, towns, tmp_path):
+    assert expected in mistake("measure-ageing", *extracts(towns[:2]), *words)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -74,7 +74,7 @@ def test_a_folder_that_holds_nothing_measured_is_told(mistake):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         ((), "measure-ageing needs --extract, or --compare"),
         (("--extract", "a.osm", "--rates", "r.toml"), "--control and --rates go with --compare"),
@@ -82,8 +82,8 @@ def test_a_folder_that_holds_nothing_measured_is_told(mistake):
         (("--compare", "a", "--extract", "b.osm", "--bounds", "1,1,2,2"), "leave out --extract and --bounds"),
     ],
 )
-def test_a_flag_of_the_other_task_is_refused_and_not_passed_over(words, told, mistake):
-    assert told in mistake("measure-ageing", *words)
+def test_a_flag_of_the_other_task_is_refused_and_not_passed_over(words, expected, mistake):
+    assert expected in mistake("measure-ageing", *words)
 
 
 def test_the_folder_of_all_output_is_taken_from_the_environment(program, towns, tmp_path, monkeypatch):

@@ -63,7 +63,7 @@ def test_figures_and_a_fitted_profile_are_written_where_asked(program, pairs, tm
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("--lengths-m", "20,x"), "--lengths-m must be positive metres as in 10,50, got '20,x'"),
         (("--lengths-m", "0"), "--lengths-m must be positive metres"),
@@ -78,20 +78,20 @@ def test_figures_and_a_fitted_profile_are_written_where_asked(program, pairs, tm
         (("--lost-s", "-1"), "lost-s"),
     ],
 )
-def test_a_mistake_gets_one_line(mistake, pairs, tmp_path, words, told) -> None:
+def test_a_mistake_gets_one_line(mistake, pairs, tmp_path, words, expected) -> None:
     (tmp_path / "bad.txt").write_text("0 1 2\n")
     (tmp_path / "loop").symlink_to("loop")
     (tmp_path / "folder").mkdir()
     (tmp_path / "late.txt").write_text("1e9 0 0 0 0 0 0 1\n1000000001 5 0 0 0 0 0 1\n")
-    assert told in mistake("measure-drift", *pairs, *words)
+    assert expected in mistake("measure-drift", *pairs, *words)
 
 
 def test_a_profile_that_cannot_be_named_or_written_gets_one_line_after_the_table(program, pairs, tmp_path) -> None:
     (tmp_path / "file").write_text("")
-    for name, told in (("Not a name.toml", "'id'"), ("file/mine.toml", "cannot be written")):
+    for name, each in (("Not a name.toml", "'id'"), ("file/mine.toml", "cannot be written")):
         code, out, err = program("measure-drift", *pairs, "--profile", name)
         assert code == 2
-        assert told in err.splitlines()[-1]
+        assert each in err.splitlines()[-1]
         assert "position_pct" in out
 
 
@@ -143,7 +143,7 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("log.csv", "--height-m", "nan"), "--height-m must be a number from 5 to 10000, got nan"),
         (("log.csv", "--speed-mps", "-1"), "--speed-mps must be a number from 0.1 to 100, got -1"),
@@ -163,11 +163,11 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
         ((".",), "sasgeo-bench: . is no flight log"),
     ],
 )
-def test_an_option_without_a_meaning_or_beyond_its_range_gets_one_line(mistake, tmp_path, words, told) -> None:
+def test_an_option_without_a_meaning_or_beyond_its_range_gets_one_line(mistake, tmp_path, words, expected) -> None:
     (tmp_path / "log.csv").write_text("time_ms,lat,lon,height_ft,heading_deg\n" + ROWS)
     (tmp_path / "run.txt").write_text("0 0 0 80 0 0 0 1\n1 9 0 80 0 0 0 1\n")
     (tmp_path / "line.kml").write_text("<kml><LineString><coordinates>9,47 9,48</coordinates></LineString></kml>")
-    assert told in mistake("read-flight", *words)
+    assert expected in mistake("read-flight", *words)
 
 
 def test_gaps_between_flights_are_told_with_their_number(program, tmp_path) -> None:

@@ -40,7 +40,7 @@ def test_a_ranking_is_scored_beside_it(program, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("import-dataset", "set", "--kind", "dens-uav"), "did you mean 'dense-uav'?"),
         (("import-dataset", "nowhere", "--kind", "dense-uav"), "there is no folder nowhere"),
@@ -49,9 +49,9 @@ def test_a_ranking_is_scored_beside_it(program, tmp_path):
         (("locate-dataset", "set", "--kind", "sues-200"), "holds no satellite-view"),
     ],
 )
-def test_a_mistake_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, told):
+def test_a_mistake_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, expected):
     writers.write_dense(tmp_path / "set", PLACES)
-    assert told in mistake(*words)
+    assert expected in mistake(*words)
     assert not (tmp_path / "out").exists()
 
 

@@ -70,8 +70,8 @@ def profile_file(folder: Path, recall: float) -> Path:
 
 def test_each_task_gets_one_line_on_stderr_and_stdout_stays_empty(program, own_out):
     words = ("--suite", "absent", "--suite", "no-priors", "--regions", RIVERSIDE, "--n", "1")
-    code, told, err = program("make-queries", *words, "--out", own_out)
-    assert (code, told) == (0, "")
+    code, printed, err = program("make-queries", *words, "--out", own_out)
+    assert (code, printed) == (0, "")
     assert [line.split(":")[0] for line in err.splitlines()] == [f"absent on {RIVERSIDE}", f"no-priors on {RIVERSIDE}"]
     assert f"5 queries at 1 site in {own_out}/tasks/absent/{RIVERSIDE}" in err.splitlines()[0]
 
@@ -91,11 +91,11 @@ def test_regions_are_built_on_the_way_and_two_at_once_give_what_one_after_the_ot
 
 
 def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
-    code, told, err = program("make-queries", "--regions", RIVERSIDE, "--regions", "town-grid", "--dry-run")
+    code, printed, err = program("make-queries", "--regions", RIVERSIDE, "--regions", "town-grid", "--dry-run")
     assert (code, err) == (0, "")
-    assert len(told.splitlines()) == 2 * len(SUITES)
+    assert len(printed.splitlines()) == 2 * len(SUITES)
     count = 8 * len(SUITES["clean"].variants) * len(SUITES["clean"].card.tracks)
-    assert f"clean on {RIVERSIDE}: at most 8 sites, {count} queries, out/tasks/clean/{RIVERSIDE}" in told
+    assert f"clean on {RIVERSIDE}: at most 8 sites, {count} queries, out/tasks/clean/{RIVERSIDE}" in printed
     assert list(tmp_path.iterdir()) == []
 
 
@@ -144,7 +144,7 @@ def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("--n", "0"), "--n must be at least 1, got 0"),
         (("--suite", "claen"), "there is no suite 'claen', did you mean 'clean'?"),
@@ -155,8 +155,8 @@ def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
         (("--detector", "published", "--detector", "mine"), "--detector 'mine' is unknown: published or measured"),
     ],
 )
-def test_a_mistake_gets_one_line_and_exit_2_and_nothing_is_written(words, told, mistake, tmp_path):
-    assert told in mistake("make-queries", "--suite", "clean", "--regions", RIVERSIDE, "--n", "1", *words)
+def test_a_mistake_gets_one_line_and_exit_2_and_nothing_is_written(words, expected, mistake, tmp_path):
+    assert expected in mistake("make-queries", "--suite", "clean", "--regions", RIVERSIDE, "--n", "1", *words)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -165,8 +165,8 @@ def test_real_ageing_of_a_region_with_one_date_gets_one_line(program, tmp_path):
     first = path.read_text().index("[[extract]]")
     path.write_text(path.read_text()[:first] + path.read_text()[path.read_text().rindex("[[extract]]") :])
     split = split_file(tmp_path, "mine", "town-grid")
-    code, told, err = program("make-queries", "--suite", "real-age", "--regions", path, "--split", split, "--n", "1")
-    assert (code, told) == (2, "")
+    code, printed, err = program("make-queries", "--suite", "real-age", "--regions", path, "--split", split, "--n", "1")
+    assert (code, printed) == (2, "")
     assert err.splitlines()[-1] == (
         "sasgeo-bench: mine cannot carry suite 'real-age': "
         "one date only, real ageing needs an older extract of the same place (--skip passes on to the next suite)"
@@ -178,9 +178,9 @@ def test_real_ageing_of_a_region_with_one_date_gets_one_line(program, tmp_path):
 
 
 def test_all_suites_are_listed_with_what_they_separate(program):
-    code, told, err = program("list", "suites")
+    code, printed, err = program("list", "suites")
     assert (code, err) == (0, "")
-    lines = told.splitlines()
+    lines = printed.splitlines()
     listed = [line.split()[0] for line in lines[1:] if line.strip()]
     assert listed[: len(EVERY_SUITE)] == list(EVERY_SUITE)  # suites of installed packages follow
     assert len(SUITES) == 17
@@ -194,14 +194,14 @@ def test_all_suites_are_listed_with_what_they_separate(program):
 
 
 def test_a_task_is_shown_with_a_sheet_of_the_right_size(program, out):
-    code, told, err = program("inspect", CLEAN, "--rows", "3", "--out", out)
+    code, printed, err = program("inspect", CLEAN, "--rows", "3", "--out", out)
     assert (code, err) == (0, "")
     sheet = out / "sheets" / f"clean-{RIVERSIDE}.png"
-    assert f"contact sheet: {sheet}" in told
+    assert f"contact sheet: {sheet}" in printed
     localization = 2 * len(SUITES["clean"].variants)
     for word in ("Rotation, scale and crop", "ODbL", "map_fingerprint", f"localization {localization}"):
-        assert word in told
-    assert not set("{}[]'") & set(told)
+        assert word in printed
+    assert not set("{}[]'") & set(printed)
     three = cv2.imread(str(sheet)).shape[0]
     heights = []
     for rows in ("1", "2"):
@@ -212,19 +212,19 @@ def test_a_task_is_shown_with_a_sheet_of_the_right_size(program, out):
 
 def test_one_query_is_shown_by_its_id_and_a_task_by_its_folder(program, out):
     name = next(read_queries(out / "tasks" / CLEAN)).query_id[:8]
-    code, told, _ = program("inspect", out / "tasks" / CLEAN, "--query", name, "--out", out)
+    code, printed, _ = program("inspect", out / "tasks" / CLEAN, "--query", name, "--out", out)
     assert code == 0
     sheet = out / "sheets" / f"clean-{RIVERSIDE}-{name}.png"
-    assert str(sheet) in told
+    assert str(sheet) in printed
     program("inspect", CLEAN, "--rows", "1", "--out", out)
     assert cv2.imread(str(sheet)).shape == cv2.imread(str(out / "sheets" / f"clean-{RIVERSIDE}.png")).shape
 
 
 def test_a_split_is_shown_with_its_map(program, tmp_path):
-    code, told, err = program("inspect", "holdout")
+    code, printed, err = program("inspect", "holdout")
     assert (code, err) == (0, "")
-    assert "nearest blocks of two parts" in told
-    assert "map of parts: out/sheets/split-holdout.png" in told
+    assert "nearest blocks of two parts" in printed
+    assert "map of parts: out/sheets/split-holdout.png" in printed
     assert cv2.imread(str(tmp_path / "out/sheets/split-holdout.png")).shape[1] > 1200
 
 
@@ -267,13 +267,13 @@ def test_a_target_that_is_something_else_is_told_what_it_is_and_what_there_is(ta
 
 
 def test_a_good_task_is_said_to_be_good_with_and_without_its_truths(program, out):
-    said = "all files are as task.json says, and every query has its truth"
-    assert program("verify", CLEAN, "--out", out) == (0, f"{CLEAN}: {said}\n", "")
+    message = "all files are as task.json says, and every query has its truth"
+    assert program("verify", CLEAN, "--out", out) == (0, f"{CLEAN}: {message}\n", "")
     (out / "truth" / CLEAN / TRUTH).unlink()
-    code, told, _ = program("verify", CLEAN, "--out", out)
+    code, printed, _ = program("verify", CLEAN, "--out", out)
     assert code == 0
-    assert "every query has its truth" not in told
-    assert "its truths are not here" in told
+    assert "every query has its truth" not in printed
+    assert "its truths are not here" in printed
 
 
 def test_faults_of_a_task_are_listed_and_make_exit_2(program, out):
@@ -281,11 +281,11 @@ def test_faults_of_a_task_are_listed_and_make_exit_2(program, out):
     data[1000] ^= 1
     (out / "tasks" / CLEAN / QUERIES).write_bytes(bytes(data))
     (out / "tasks" / CLEAN / "stray.txt").write_text("?")
-    code, told, err = program("verify", CLEAN, "--out", out)
+    code, printed, err = program("verify", CLEAN, "--out", out)
     assert (code, err) == (2, "")
-    assert "queries.parquet: " in told
-    assert "SHA-256" in told
-    assert "stray.txt: not part of a task" in told
+    assert "queries.parquet: " in printed
+    assert "SHA-256" in printed
+    assert "stray.txt: not part of a task" in printed
 
 
 def test_one_target_is_verified_and_tasks_are_for_answers_alone(mistake, out):
@@ -297,9 +297,9 @@ def test_one_target_is_verified_and_tasks_are_for_answers_alone(mistake, out):
 
 @pytest.mark.parametrize("name", ["holdout", "crossfit"])
 def test_the_towns_of_the_shipped_splits_share_no_ground(name, program, towns):
-    code, told, err = program("verify", name, "--out", towns)
+    code, printed, err = program("verify", name, "--out", towns)
     assert code == 0
-    assert told == f"{name}: no two parts share ground, 2 regions searched\n"
+    assert printed == f"{name}: no two parts share ground, 2 regions searched\n"
     assert err.startswith("not searched, for not built: ")
 
 
@@ -308,14 +308,14 @@ def test_one_town_under_two_names_in_two_parts_is_caught(program, own_out, tmp_p
     build_region(plan_build(read_region_file(path), out=own_out))
     for kind in ("holdout", "crossfit"):
         split = split_file(tmp_path, RIVERSIDE, "elsewhere", "town-grid", "town-suburb", kind=kind)
-        code, told, err = program("verify", split, "--regions", path.parent, "--out", own_out)
+        code, printed, err = program("verify", split, "--regions", path.parent, "--out", own_out)
         assert (code, err) == (2, "not searched, for not built: town-suburb\n")
-        (line,) = told.splitlines()
+        (line,) = printed.splitlines()
         assert f"{RIVERSIDE}/0-0 and elsewhere/0-0 of different parts hold the same ground: " in line
         assert int(line.split("ground: ")[1].split()[0]) > 50
 
 
 def test_a_split_of_which_nothing_is_built_gets_one_line(program):
-    code, told, err = program("verify", "holdout")
-    assert (code, told) == (2, "")
+    code, printed, err = program("verify", "holdout")
+    assert (code, printed) == (2, "")
     assert err.splitlines()[-1].endswith("build-region more")

@@ -66,9 +66,9 @@ def run_folder(program, out, monkeypatch):
     """Where the control's rows are, in one part, after a run."""
     del out
     monkeypatch.setattr("sasgeo_bench.running.answers.PART_S", 3600.0)
-    code, told, err = program(*ORACLE)
+    code, printed, err = program(*ORACLE)
     assert code == 0, err
-    return Path(told.strip())
+    return Path(printed.strip())
 
 
 def change_task(**changes):
@@ -87,9 +87,9 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: x-own\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text(f"[{MATCHERS}]\nmine = nowhere.to_be:Found\n")
     monkeypatch.syspath_prepend(str(about.parent))
-    code, told, err = program("list", "matchers")
+    code, printed, err = program("list", "matchers")
     assert (code, err) == (0, "")
-    head, *rows = (line.split() for line in told.splitlines() if line)
+    head, *rows = (line.split() for line in printed.splitlines() if line)
     assert head == ["matcher", "package", "class"]
     assert ["mine", "x-own", "nowhere.to_be:Found"] in rows
     assert [row[0] for row in rows] == sorted(row[0] for row in rows)
@@ -97,7 +97,7 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("kind", "name", "said"),
+    ("kind", "name", "expected"),
     [
         ("matchers", "road_2rit", "title: "),
         ("trackers", "swapf", "source: "),
@@ -106,12 +106,12 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
         ("matchers", "oracle_pose", "oracle_pose: a control, given the truth, and has no card"),
     ],
 )
-def test_the_card_of_one_is_shown_field_by_field(kind, name, said, program) -> None:
-    code, told, err = program("list", kind, name)
+def test_the_card_of_one_is_shown_field_by_field(kind, name, expected, program) -> None:
+    code, printed, err = program("list", kind, name)
     assert (code, err) == (0, "")
-    lines = told.splitlines()
-    assert lines[0].startswith(f"name: {name}" if len(lines) > 1 else said)
-    assert any(line.startswith(said) and len(line) > len(said) - 1 for line in lines)
+    lines = printed.splitlines()
+    assert lines[0].startswith(f"name: {name}" if len(lines) > 1 else expected)
+    assert any(line.startswith(expected) and len(line) > len(expected) - 1 for line in lines)
 
 
 @pytest.mark.parametrize(
@@ -143,20 +143,20 @@ def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, m
     pip.touch(mode=0o755)
     monkeypatch.setattr(sys, "executable", str(pip.with_name("python")))
     monkeypatch.setenv("PATH", str(pip.parent))
-    code, told, err = program("new", "matcher", "my-matcher")
+    code, printed, err = program("new", "matcher", "my-matcher")
     assert code == 0
     assert "enter docs/results/systems-objects --matcher my-matcher" in err
-    assert told == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check my-matcher\n"
+    assert printed == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check my-matcher\n"
     assert (tmp_path / "my-matcher" / "src" / "my_matcher" / "matcher.py").is_file()
     monkeypatch.setenv("PATH", "")  # a pip that would install for another Python is not named
-    code, told, _ = program("new", "matcher", "other", "--into", "deep/er")
-    assert f"next: {pip} install -e deep/er && " in told
-    assert (code, told.split(":")[0]) == (0, "deep/er")
+    code, printed, _ = program("new", "matcher", "other", "--into", "deep/er")
+    assert f"next: {pip} install -e deep/er && " in printed
+    assert (code, printed.split(":")[0]) == (0, "deep/er")
     assert (tmp_path / "deep" / "er" / "pyproject.toml").is_file()
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("My Matcher",), "lower-case letters, digits, hyphens and underscores"),
         (("../x",), "lower-case letters, digits, hyphens and underscores"),
@@ -167,19 +167,19 @@ def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, m
         (("mine", "--into", "full/file/deep"), "full/file/deep cannot be written"),
     ],
 )
-def test_a_matcher_that_cannot_be_made_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, told) -> None:
+def test_a_matcher_that_cannot_be_made_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, expected) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("")
-    assert told in mistake("new", "matcher", *words)
+    assert expected in mistake("new", "matcher", *words)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full"]
 
 
 def test_a_good_matcher_gets_a_table_and_exit_0(check) -> None:
-    code, told, err = check("faulty:Good")
+    code, given, err = check("faulty:Good")
     assert (code, err) == (0, "")
-    assert told.splitlines()[0].split() == ["check", "outcome", "found"]
-    assert " fail " not in told
-    assert told.count(" pass ") == 13
+    assert given.splitlines()[0].split() == ["check", "outcome", "found"]
+    assert " fail " not in given
+    assert given.count(" pass ") == 13
 
 
 @pytest.mark.parametrize(
@@ -190,9 +190,9 @@ def test_a_good_matcher_gets_a_table_and_exit_0(check) -> None:
     ],
 )
 def test_a_matcher_with_a_fault_gets_its_row_a_line_on_stderr_and_exit_2(check, spec, words) -> None:
-    code, told, err = check(spec)
+    code, given, err = check(spec)
     assert code == 2
-    assert [line for line in told.splitlines() if " fail " in line and words in line]
+    assert [line for line in given.splitlines() if " fail " in line and words in line]
     assert err == f"{spec}: 1 check failed\n"
 
 
@@ -200,52 +200,52 @@ def test_a_matcher_with_a_fault_gets_its_row_a_line_on_stderr_and_exit_2(check, 
 
 
 def test_a_run_says_what_is_left_is_cut_off_goes_on_and_is_validated_and_merged(program, out, ids) -> None:
-    code, told, err = program(*GOOD, "--dry-run")
+    code, printed, err = program(*GOOD, "--dry-run")
     assert (code, err) == (0, "")
-    assert "good 1 (" in told
-    assert f"{len(ids)} queries left, 0 done" in told
+    assert "good 1 (" in printed
+    assert f"{len(ids)} queries left, 0 done" in printed
     assert not (out / "runs").exists()
-    code, told, err = program(*GOOD, "--limit", "2")
+    code, printed, err = program(*GOOD, "--limit", "2")
     assert (code, err) == (0, "good 1: 2 ok\n")
-    folder = Path(told.strip())
+    folder = Path(printed.strip())
     assert folder.parts[:3] == ("out", "runs", "good")
-    code, told, err = program("validate", "--predictions", folder, "--tasks", TASK)
+    code, printed, err = program("validate", "--predictions", folder, "--tasks", TASK)
     assert (code, err) == (2, f"{folder}: {len(ids) - 2} violations\n")
-    assert all(line.endswith("expected one for every query") for line in told.splitlines())
-    code, told, err = program(*GOOD, "--jobs", "2")
-    assert (code, told, err) == (0, f"{folder}\n", f"good 1: {len(ids) - 2} ok\n")
-    code, told, err = program("validate", "--predictions", folder, "--tasks", TASK)
-    assert (code, told, err) == (0, f"{folder}: answers every query of 1 task, and nothing else\n", "")
-    code, told, err = program("merge", "--runs", folder, "--into", "all.parquet")
-    assert (code, told, err) == (0, f"all.parquet: {len(ids)} predictions\n", "")
+    assert all(line.endswith("expected one for every query") for line in printed.splitlines())
+    code, printed, err = program(*GOOD, "--jobs", "2")
+    assert (code, printed, err) == (0, f"{folder}\n", f"good 1: {len(ids) - 2} ok\n")
+    code, printed, err = program("validate", "--predictions", folder, "--tasks", TASK)
+    assert (code, printed, err) == (0, f"{folder}: answers every query of 1 task, and nothing else\n", "")
+    code, printed, err = program("merge", "--runs", folder, "--into", "all.parquet")
+    assert (code, printed, err) == (0, f"all.parquet: {len(ids)} predictions\n", "")
 
 
 def test_a_second_run_says_that_nothing_is_left(program, run_folder, ids) -> None:
-    code, told, err = program(*ORACLE)
-    assert (code, told) == (0, f"{run_folder}\n")
+    code, printed, err = program(*ORACLE)
+    assert (code, printed) == (0, f"{run_folder}\n")
     assert f"{run_folder}: nothing left, {len(ids)} done" in err
-    code, told, _ = program(*ORACLE, "--dry-run")
-    assert f"0 queries left, {len(ids)} done" in told
+    code, printed, _ = program(*ORACLE, "--dry-run")
+    assert f"0 queries left, {len(ids)} done" in printed
 
 
 def test_several_tasks_are_run_and_validated_at_once(program, out) -> None:
     del out
     tasks = ("--tasks", TASK, "--tasks", TASK.parent.parent / "clean" / TOWN)
-    code, told, _ = program("run", "--matcher", "oracle_pose", *tasks)
-    folders = told.splitlines()
+    code, printed, _ = program("run", "--matcher", "oracle_pose", *tasks)
+    folders = printed.splitlines()
     assert (code, len(folders)) == (0, 2)
     merged = (word for folder in folders for word in ("--runs", folder))
     assert program("merge", *merged, "--into", "all.parquet")[0] == 0
-    code, told, _ = program("validate", "--predictions", "all.parquet", *tasks)
-    assert (code, told) == (0, "all.parquet: answers every query of 2 tasks, and nothing else\n")
+    code, printed, _ = program("validate", "--predictions", "all.parquet", *tasks)
+    assert (code, printed) == (0, "all.parquet: answers every query of 2 tasks, and nothing else\n")
 
 
 def test_a_run_without_a_sound_row_ends_with_a_status_that_a_script_sees(program, out, ids) -> None:
-    code, told, err = program("run", "--matcher", "faulty:RaisesInPrepare", "--tasks", TASK)
+    code, printed, err = program("run", "--matcher", "faulty:RaisesInPrepare", "--tasks", TASK)
     assert code == CONTESTANT_FAILED
     assert f"{len(ids)} crash" in err
     assert err.splitlines()[-1] == "no query was answered, so the command ends with status 4; the rows are kept"
-    assert len(prediction_files.read_ties(out.parent / told.strip())) == len(ids)
+    assert len(prediction_files.read_ties(out.parent / printed.strip())) == len(ids)
     again = program("run", "--matcher", "faulty:RaisesInPrepare", "--tasks", TASK)
     assert again[0] == 0, again[2]  # nothing was left to ask
     assert f": {len(ids)} earlier queries ended as crash; --again crash asks again\n" in again[2]
@@ -260,8 +260,8 @@ def test_of_many_tasks_the_first_are_named_and_the_rest_counted(program, run_fol
     monkeypatch.setattr("sasgeo_bench.running.runner.MOST_LINES", 0)
     other = TASK.parent.parent / "clean" / TOWN
     more = len(task_files.Task.open(other).ids())
-    code, told, _ = program(*ORACLE, "--tasks", other, "--dry-run")
-    assert (code, told.splitlines()[1:]) == (
+    code, printed, _ = program(*ORACLE, "--tasks", other, "--dry-run")
+    assert (code, printed.splitlines()[1:]) == (
         0,
         [
             f"  {run_folder}: 0 queries left, {len(ids)} done",
@@ -275,15 +275,15 @@ def test_of_many_tasks_the_first_are_named_and_the_rest_counted(program, run_fol
 
 def test_answers_to_what_a_query_was_are_set_aside_by_validate_and_merge(program, mistake, run_folder, ids) -> None:
     prediction_files.write_part(run_folder, [Prediction(query_id=ids[0])], asked={ids[0]: "0" * 64})
-    code, told, err = program("validate", "--predictions", run_folder, "--tasks", TASK)
+    code, printed, err = program("validate", "--predictions", run_folder, "--tasks", TASK)
     assert (code, err) == (0, "")
-    assert told == f"{run_folder}: answers every query of 1 task, 1 answer to other queries set aside\n"
-    code, told, _ = program(*ORACLE, "--dry-run")
-    assert f"0 queries left, {len(ids)} done, 1 answer to other queries set aside" in told
+    assert printed == f"{run_folder}: answers every query of 1 task, 1 answer to other queries set aside\n"
+    code, printed, _ = program(*ORACLE, "--dry-run")
+    assert f"0 queries left, {len(ids)} done, 1 answer to other queries set aside" in printed
     words = ("merge", "--runs", run_folder, "--into", "mine.parquet")
     assert mistake(*words).endswith("name the tasks with --tasks")
-    code, told, _ = program(*words, "--tasks", TASK)
-    assert (code, told) == (0, f"mine.parquet: {len(ids)} predictions\n")
+    code, printed, _ = program(*words, "--tasks", TASK)
+    assert (code, printed) == (0, f"mine.parquet: {len(ids)} predictions\n")
     assert all(
         item.candidates or item.query_id != ids[0] for item in prediction_files.read_predictions(Path("mine.parquet"))
     )
@@ -296,7 +296,7 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("--shard", "0/2"), "--shard must be i/n with 1 <= i <= n, got 0/2"),
         (("--limit", "-1"), "--limit must be at least 1, got -1"),
@@ -312,17 +312,17 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
         (("--out", "a-file"), "cannot be written (Not a directory)"),
     ],
 )
-def test_a_run_that_makes_no_sense_gets_one_line_and_nothing_is_written(mistake, out, words, told) -> None:
+def test_a_run_that_makes_no_sense_gets_one_line_and_nothing_is_written(mistake, out, words, expected) -> None:
     Path("a-file").write_text("")
-    assert told in mistake(*ORACLE, *words)
+    assert expected in mistake(*ORACLE, *words)
     assert not (out / "runs").exists()
 
 
 def test_a_matcher_that_does_not_learn_says_so(program, out) -> None:
     del out
-    code, told, err = program(*ORACLE, "--train", TASK, "--dry-run")
+    code, printed, err = program(*ORACLE, "--train", TASK, "--dry-run")
     assert (code, err) == (0, "")
-    assert told.splitlines()[1] == "  has no learn(): training data are ignored"
+    assert printed.splitlines()[1] == "  has no learn(): training data are ignored"
 
 
 @pytest.mark.parametrize(
@@ -375,10 +375,10 @@ def test_missing_double_and_foreign_rows_get_a_line_each_and_exit_2(program, min
     names = [*ids[1:], ids[1], "feedfeed"]
     count = len(ids)
     path = mine([Prediction(query_id=name) for name in names])
-    code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
+    code, printed, err = program("validate", "--predictions", path, "--tasks", TASK)
     assert (code, err) == (2, "mine.parquet: 3 violations\n")
     found = f"{ids[1]} again (mine.parquet, row 0)"
-    assert told.splitlines() == [
+    assert printed.splitlines() == [
         f"mine.parquet, row {count - 1}, query_id: found {found}, expected each query once",
         f"mine.parquet, row {count}, query_id: found 'feedfeed', expected the id of a query of the tasks",
         f"mine.parquet, query_id: found no row for {ids[0]}, expected one for every query",
@@ -388,9 +388,9 @@ def test_missing_double_and_foreign_rows_get_a_line_each_and_exit_2(program, min
 def test_of_many_queries_without_a_row_some_are_named_and_the_rest_counted(program, mine, ids, monkeypatch) -> None:
     monkeypatch.setattr("sasgeo_bench.cli.verifying.MOST_MISSING", 2)
     path = mine([Prediction(query_id=ids[0])])
-    code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
+    code, printed, err = program("validate", "--predictions", path, "--tasks", TASK)
     assert (code, err) == (2, f"mine.parquet: {len(ids) - 1} violations\n")
-    *named, last = told.splitlines()
+    *named, last = printed.splitlines()
     assert [line.split()[6].rstrip(",") for line in named] == ids[1:3]
     assert last.startswith(f"mine.parquet, query_id: found no row for {len(ids) - 3} more quer")
 
@@ -398,9 +398,9 @@ def test_of_many_queries_without_a_row_some_are_named_and_the_rest_counted(progr
 def test_a_column_that_is_missing_is_told_once_and_not_for_every_query(program, mine) -> None:
     path = mine()
     pq.write_table(pq.read_table(path).drop_columns(["latency_s", "query_id"]), path)
-    code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
+    code, printed, err = program("validate", "--predictions", path, "--tasks", TASK)
     assert (code, err) == (2, "mine.parquet: 2 violations\n")
-    assert told.splitlines() == [
+    assert printed.splitlines() == [
         "mine.parquet, query_id: found nothing, expected a column of string",
         "mine.parquet, latency_s: found nothing, expected a column of double",
     ]
@@ -412,9 +412,9 @@ def test_a_column_that_is_missing_is_told_once_and_not_for_every_query(program, 
 def test_predictions_for_a_task_of_another_version_are_not_validated(mistake, mine, version, words) -> None:
     path = mine()
     change_task(task_version=version)
-    told = mistake("validate", "--predictions", path, "--tasks", TASK)
-    assert words in told
-    assert told.endswith("make the queries again")
+    given = mistake("validate", "--predictions", path, "--tasks", TASK)
+    assert words in given
+    assert given.endswith("make the queries again")
 
 
 def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
@@ -425,8 +425,8 @@ def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
         ("validate", "--predictions", path, "--tasks", name),
         ("leaderboard", f"{name}.toml"),
     ):
-        told = mistake(*words)
-        assert "File name too long; check the path, your rights and the free space: xxx" in told
+        given = mistake(*words)
+        assert "File name too long; check the path, your rights and the free space: xxx" in given
     for truth, fault in (("nowhere", "where there is no folder"), ("out/tasks", "which holds no truths")):
         assert f"--truth names {truth}, {fault}" in mistake("score", "--predictions", path, "--truth", truth)
     assert "--name must hold letters" in mistake("score", "--predictions", path, "--name", name)
@@ -435,8 +435,8 @@ def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
 def test_the_runs_of_two_matchers_are_not_validated_as_one(mistake, run_folder) -> None:
     other = Path(shutil.copytree(run_folder, run_folder.parents[3] / "other" / "x" / SUITE / TOWN))
     edit_run(other, name="other")
-    told = mistake("validate", "--predictions", run_folder.parents[3], "--tasks", TASK)
-    assert told.endswith("two matchers, versions or settings are never mixed, name the folder of one")
+    given = mistake("validate", "--predictions", run_folder.parents[3], "--tasks", TASK)
+    assert given.endswith("two matchers, versions or settings are never mixed, name the folder of one")
 
 
 def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:

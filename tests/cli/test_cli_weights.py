@@ -20,26 +20,26 @@ def learnt_file(tmp_path):
 
 
 def test_without_a_region_a_table_by_hand_is_printed(program):
-    code, told, _ = program("weights", "--age", "0", "--age", "20")
+    code, out, _ = program("weights", "--age", "0", "--age", "20")
     assert code == 0
-    railway = next(line for line in told.splitlines() if line.startswith("railway"))
+    railway = next(line for line in out.splitlines() if line.startswith("railway"))
     assert railway.split() == ["railway", "2.30", "1.84"]
 
 
 def test_fitted_stands_beside_hand_and_no_line_is_wider_than_a_terminal(program, learnt_file):
-    code, told, _ = program("weights", "--learned", learnt_file)
+    code, out, _ = program("weights", "--learned", learnt_file)
     assert code == 0
-    assert told.count("railway") == 6
-    heads = [line.split() for line in told.splitlines() if "fitted" in line]
+    assert out.count("railway") == 6
+    heads = [line.split() for line in out.splitlines() if "fitted" in line]
     assert heads[0] == ["hand"] * 5 + ["fitted"] * 5
-    assert max(map(len, (line for line in told.splitlines() if not line.startswith("weight of")))) <= 80
+    assert max(map(len, (line for line in out.splitlines() if not line.startswith("weight of")))) <= 80
 
 
 @pytest.mark.slow
 def test_a_region_gets_a_picture_for_each_age(program, own_out):
-    code, told, _ = program("weights", TOWN, "--age", "0", "--age", "10", "--season", "snow", "--out", own_out)
+    code, out, _ = program("weights", TOWN, "--age", "0", "--age", "10", "--season", "snow", "--out", own_out)
     assert code == 0
-    paths = [line.removeprefix("map of weights: ") for line in told.splitlines() if line.startswith("map of")]
+    paths = [line.removeprefix("map of weights: ") for line in out.splitlines() if line.startswith("map of")]
     assert [path.rsplit("-", 2)[1] for path in paths] == ["0y", "10y"]
     young, old = (image.imread(path) for path in paths)
     assert young.shape == old.shape
@@ -68,11 +68,11 @@ def test_only_a_file_of_a_run_is_advised_to_be_removed(mistake, tmp_path):
     own.parent.mkdir(parents=True)
     own.write_bytes(b"\xff")
     (tmp_path / "layers.tif").write_bytes(b"\xff")
-    told = {path: mistake("weights", "--learned", path) for path in ("out", "layers.tif", own)}
-    assert "out is a folder, not a learned text: name a .json of out/runs/<matcher>/<hash>/learned/" in told["out"]
-    assert "layers.tif is no learned text (" in told["layers.tif"]
-    assert told[own].endswith("remove this file and run again, which trains anew")
-    assert not any("remove" in told[path] for path in ("out", "layers.tif"))
+    values = {path: mistake("weights", "--learned", path) for path in ("out", "layers.tif", own)}
+    assert "out is a folder, not a learned text: name a .json of out/runs/<matcher>/<hash>/learned/" in values["out"]
+    assert "layers.tif is no learned text (" in values["layers.tif"]
+    assert values[own].endswith("remove this file and run again, which trains anew")
+    assert not any("remove" in values[path] for path in ("out", "layers.tif"))
 
 
 def test_a_missing_file_and_foreign_classes_get_one_line(mistake, tmp_path, learnt_file):

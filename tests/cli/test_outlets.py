@@ -140,8 +140,8 @@ def test_an_interrupted_command_says_what_is_kept_and_how_to_go_on(program, monk
     code, out, err = program("build-region", "town-grid", "--quiet")
     assert (code, out) == (130, "")
     assert err == ("sasgeo-bench: interrupted; regions that were built are kept; the same command builds the others\n")
-    told = "sasgeo-bench: interrupted; nothing is half-written, and what was there before is kept; run it again\n"
-    assert program("doctor")[2] == told
+    message = "sasgeo-bench: interrupted; nothing is half-written, and what was there before is kept; run it again\n"
+    assert program("doctor")[2] == message
 
 
 # Strikes when a module is imported, once: as an interrupt, or as what Python 3.11 makes of one in a class body.
@@ -161,16 +161,16 @@ main()
 
 @pytest.mark.parametrize("strike", ["raise KeyboardInterrupt", "raise RuntimeError('x') from KeyboardInterrupt()"])
 @pytest.mark.parametrize(
-    ("module", "told"),
+    ("module", "expected"),
     [("typer", "interrupted before it began; run it again"), ("rasterio", "interrupted; regions that were built are")],
 )
-def test_an_interrupted_import_is_one_line(tmp_path, strike, module, told):
+def test_an_interrupted_import_is_one_line(tmp_path, strike, module, expected):
     words = [sys.executable, "-c", STRUCK.format(module=module, strike=strike), "build-region", "town-grid"]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     ended = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
     assert (ended.returncode, ended.stdout) == (130, "")
     (line,) = ended.stderr.splitlines()
-    assert line.startswith(f"sasgeo-bench: {told}")
+    assert line.startswith(f"sasgeo-bench: {expected}")
 
 
 def test_what_is_kept_is_said_of_commands_that_there_are():

@@ -34,7 +34,7 @@ def fault(text: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         ('nam = "x"', "unknown key 'nam', did you mean 'name'?"),
         ('name = "x"\n[[inner]]\ndepth = 2.0', "did you mean 'depth_m'?"),
@@ -53,8 +53,8 @@ def fault(text: str) -> str:
         ("name = ", "not valid TOML"),
     ],
 )
-def test_a_fault_is_told_in_plain_words(text, said):
-    assert said in fault(text)
+def test_a_fault_is_told_in_plain_words(text, expected):
+    assert expected in fault(text)
 
 
 def test_a_file_full_of_faults_names_the_first_few():

@@ -179,9 +179,9 @@ def test_one_long_text_in_many_rows_is_refused_before_it_is_unpacked(kind, rows,
     path = tmp_path / "a.parquet"
     pq.write_table(pa.table({"n": range(len(BOMBS[kind])), "a": BOMBS[kind]}), path, row_group_size=rows)
     assert path.stat().st_size < 10**6
-    with pytest.raises(StoreError, match="bytes unpacked") as told:
+    with pytest.raises(StoreError, match="bytes unpacked") as caught:
         read_table(path, mend=MEND)
-    assert str(told.value).endswith(MEND)
+    assert str(caught.value).endswith(MEND)
     fewer = tmp_path / "b.parquet"
     pq.write_table(pa.table({"a": BOMBS[kind][:1]}), fewer, row_group_size=rows)
     assert read_table(fewer, mend=MEND)["a"].to_pylist() == BOMBS[kind][:1].to_pylist()

@@ -265,7 +265,7 @@ def test_a_list_that_is_none_is_refused_in_a_line(url, tmp_path, folder, text):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (("send", "vaduz", "nonsense://a/b"), "nonsense://a/b cannot be reached (Protocol not known"),
         (("send", "vaduz", "memory://"), "names no place in a storage"),
@@ -280,12 +280,12 @@ def test_a_list_that_is_none_is_refused_in_a_line(url, tmp_path, folder, text):
         (("fetch", "memory://nobody/sent", "vaduz/region.json/here"), "region.json is a file"),
     ],
 )
-def test_mistakes_are_told_in_a_line(folder, mistake, monkeypatch, words, told):
+def test_mistakes_are_told_in_a_line(folder, mistake, monkeypatch, words, expected):
     monkeypatch.chdir(folder.parent)
     (folder / "empty").mkdir()
     (folder.parent / "odd").mkdir()
     (folder.parent / "odd" / "a\\b").write_text("", encoding="utf-8")
-    assert told in (line := mistake(*words))
+    assert expected in (line := mistake(*words))
     assert "secret" not in line
 
 
@@ -322,10 +322,10 @@ def test_a_region_its_tasks_and_a_run_are_the_same_at_another_place(tmp_path, la
     out, there = lay_towns(tmp_path / "out", "town-riverside"), tmp_path / "there"
     (task,) = sgb.make_tasks(suite="clean", regions="town-riverside", n=1, up_to=True, out=out)
     for name in ("regions/town-riverside", "tasks/clean/town-riverside", "truth/clean/town-riverside"):
-        code, said, _ = program("send", out / name, f"memory://out/{name}")
-        assert (code, "sent" in said) == (0, True)
-        code, said, _ = program("fetch", f"memory://out/{name}", there / name)
-        assert (code, "fetched" in said) == (0, True)
+        code, printed, _ = program("send", out / name, f"memory://out/{name}")
+        assert (code, "sent" in printed) == (0, True)
+        code, printed, _ = program("fetch", f"memory://out/{name}", there / name)
+        assert (code, "fetched" in printed) == (0, True)
         assert contents(there / name) == seen(out / name)
     sgb.run(matcher="prior_centre", tasks=there / task.relative_to(out), out=there)
     send(there / "runs", "memory://out/runs")

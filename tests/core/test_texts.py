@@ -227,9 +227,9 @@ def test_a_figure_is_drawn_and_shows_the_text(tmp_path_factory, harmless, text):
     path = tmp_path_factory.mktemp("figure") / "figure.svg"
     svg = drawn(path, text[:200]).decode()
     assert svg_fault(svg) is None
-    said = {"".join(item.itertext()) for item in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")}  # noqa: S314
+    values = {"".join(item.itertext()) for item in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")}  # noqa: S314
     for line in text[:200].split("\n"):
-        assert plain(line) in said or not plain(line).strip()
+        assert plain(line) in values or not plain(line).strip()
     assert properties_of(svg) <= harmless | {"transform", "text-anchor", "font", "fill"}
 
 
@@ -250,12 +250,12 @@ def test_a_terminal_gets_the_text_and_nothing_that_steers_it(capsys, text):
     print_table(table)
     say(f"<{text}>")
     tell(f"<{text}>")
-    told = capsys.readouterr()
-    for line in (*told.out.split("\n"), *told.err.split("\n")):
+    out = capsys.readouterr()
+    for line in (*out.out.split("\n"), *out.err.split("\n")):
         assert line.isprintable()
-    assert plain_lines(f"<{text}>") in told.out
-    assert f"<{plain(text)}>" in told.err
-    assert told.err.count("\n") == 1
+    assert plain_lines(f"<{text}>") in out.out
+    assert f"<{plain(text)}>" in out.err
+    assert out.err.count("\n") == 1
 
 
 @pytest.mark.parametrize("text", ["[red]x[/red]", ":smile:", "[/]", "\x1b[31m"])
@@ -406,10 +406,10 @@ def root(tasks, tmp_path_factory):
         folder.mkdir(parents=True)
         for file in place.iterdir():
             (folder / file.name).symlink_to(file)
-        said = read_manifest(place)
+        record = read_manifest(place)
         (folder / "region.json").unlink()
         drops = {f"highway={WORDS}\n\x1b[31m": 3}
-        write_manifest(folder, said.model_copy(update={"title": WORDS, "drops": drops, "warnings": (WORDS,)}))
+        write_manifest(folder, record.model_copy(update={"title": WORDS, "drops": drops, "warnings": (WORDS,)}))
     card = SAID | dict.fromkeys(("title", "source", "ours", "licence", "limits"), WORDS)
     for suite, region in ASKED:
         folder, task = out / "runs" / "mine" / HASH / suite / region, out / "tasks" / suite / region

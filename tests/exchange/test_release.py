@@ -225,10 +225,10 @@ def test_the_lines_of_the_card_run_and_show_what_our_own_code_sees(written: Path
     blocked = 'import sys\nsys.modules["sasgeo_bench"] = None\n'
     saved = "\nnp.save(sys.argv[1], cells)\nprint(row['query_id'])"
     copied = Path(shutil.copytree(written, tmp_path / "copy"))
-    told = _python(blocked + "\n".join(blocks) + saved, copied, str(tmp_path / "cells.npy"))
+    given = _python(blocked + "\n".join(blocks) + saved, copied, str(tmp_path / "cells.npy"))
     table = re.search(r'read_parquet\("(tasks/[^"]+)"', card)[1]
     first = next(task_files.read_queries((written / table).parent))
-    assert told.splitlines()[-1] == first.query_id
+    assert given.splitlines()[-1] == first.query_id
     np.testing.assert_array_equal(np.load(tmp_path / "cells.npy"), first.evidence.cells)
 
 
@@ -304,11 +304,11 @@ def test_pystac_finds_the_catalog_valid_and_its_links_lead_to_the_files(written:
     assert [item.id for item in items] == [GRID, f"{GRID}+alias", RIVERSIDE]
     validator = JsonSchemaSTACValidator()
     for one in (catalog, *collections, *items):
-        said = json.loads(Path(one.get_self_href()).read_text(encoding="utf-8"))
-        assert validator.validate_core(said, one.STAC_OBJECT_TYPE, "1.1.0")
-        outward = [link for link in said["links"] if link["rel"] != "license"]
+        manifest = json.loads(Path(one.get_self_href()).read_text(encoding="utf-8"))
+        assert validator.validate_core(manifest, one.STAC_OBJECT_TYPE, "1.1.0")
+        outward = [link for link in manifest["links"] if link["rel"] != "license"]
         assert all(not re.match(r"[a-z]+:|/", link["href"]) for link in outward)
-        assert [link["href"] for link in said["links"] if link["rel"] == "license"]
+        assert [link["href"] for link in manifest["links"] if link["rel"] == "license"]
     for item in items:
         jsonschema.validate(item.properties, FIELDS)
         with rasterio.open(item.assets["layers"].get_absolute_href()) as layers:
@@ -371,16 +371,16 @@ def test_every_file_names_its_source_and_licence_in_itself(written: Path) -> Non
     for path in _files(written):
         if path.suffix == ".tif":
             with rasterio.open(path) as raster:
-                said = raster.tags()["attribution"]
+                record = raster.tags()["attribution"]
         elif path.suffix == ".parquet":
-            said = " ".join(value.decode() for key, value in pq.read_schema(path).metadata.items() if key != b"geo")
+            record = " ".join(value.decode() for key, value in pq.read_schema(path).metadata.items() if key != b"geo")
         elif path.suffix == ".png":
-            said = Image.open(path).text["Copyright"]
+            record = Image.open(path).text["Copyright"]
         elif path.name == "SHA256SUMS":
             continue  # hashes alone, in the form that sha256sum reads
         else:
-            said = path.read_text(encoding="utf-8")
-        assert ATTRIBUTION in said, path
+            record = path.read_text(encoding="utf-8")
+        assert ATTRIBUTION in record, path
 
 
 # --- what is in it --------------------------------------------------------------------------------------------------
@@ -401,12 +401,12 @@ def test_ground_is_counted_once_whatever_the_number_of_its_maps(written: Path) -
 
 
 def test_in_a_cross_fit_no_truth_is_released_unless_asked_for(source: Path, written: Path, tmp_path: Path) -> None:
-    told: list[str] = []
-    with reporting(told.append):
+    lines: list[str] = []
+    with reporting(lines.append):
         make_release(_request(source, tmp_path / FOLDER))
     assert not (tmp_path / FOLDER / "truth").exists()
     assert (written / "truth/clean" / RIVERSIDE / "truth.parquet").is_file()
-    assert any("their seed is so small that anyone can find it" in line for line in told)
+    assert any("their seed is so small that anyone can find it" in line for line in lines)
     everything = b"".join(path.read_bytes() for path in _files(tmp_path / FOLDER) if path.suffix in {".json", ".md"})
     assert b"request_sha256" not in everything
     assert b'"seed"' not in everything
@@ -468,7 +468,7 @@ OF_A_MAP = ("layers.tif", "features.parquet", "nodes.parquet", "edges.parquet")
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         ({"licence": ""}, "says no licence or no attribution, and a release must: build the region again"),
         ({"files": {}}, "is damaged (its files lack layers.tif): build the region again"),
@@ -482,14 +482,14 @@ OF_A_MAP = ("layers.tif", "features.parquet", "nodes.parquet", "edges.parquet")
         ({"fingerprint": "0" * 64}, f"{RIVERSIDE} was built anew since: make the queries again"),
     ],
 )
-def test_a_region_that_is_not_fit_is_refused(changes, told, own, mistake):
+def test_a_region_that_is_not_fit_is_refused(changes, expected, own, mistake):
     _edit(own / "regions" / RIVERSIDE / "region.json", **changes)
-    assert told in mistake("release", "--regions", RIVERSIDE, "--out", own)
+    assert expected in mistake("release", "--regions", RIVERSIDE, "--out", own)
     assert not (own / FOLDER).exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "expected"),
     [
         (
             ("--regions", RIVERSIDE, "--url", "javascript:alert(1)"),
@@ -514,9 +514,9 @@ def test_a_region_that_is_not_fit_is_refused(changes, told, own, mistake):
         (("--regions", RIVERSIDE, "--date", "yesterday"), "--date must be a date as in 2021-10-28"),
     ],
 )
-def test_a_request_that_makes_no_sense_gets_one_line(words, told, own, mistake):
+def test_a_request_that_makes_no_sense_gets_one_line(words, expected, own, mistake):
     del own
-    assert told in mistake("release", *words, "--out", "out")
+    assert expected in mistake("release", *words, "--out", "out")
 
 
 def test_damaged_files_and_regions_without_queries_are_refused_and_nothing_is_written(own, program):
@@ -566,8 +566,8 @@ def test_a_folder_of_another_program_with_files_of_the_same_names_is_saved(own, 
         (folder / name).write_text(text, encoding="utf-8")
     sums = [f"{sha256_of(folder / name)}  {name}\n" for name in ("thesis.tex", "release.json")]
     (folder / "SHA256SUMS").write_text("".join(sums), encoding="utf-8")
-    told = mistake("release", "--regions", RIVERSIDE, "--out", own, "--into", folder)
-    assert "(SHA256SUMS, release.json, thesis.tex) that would be lost" in told
+    given = mistake("release", "--regions", RIVERSIDE, "--out", own, "--into", folder)
+    assert "(SHA256SUMS, release.json, thesis.tex) that would be lost" in given
     assert (folder / "thesis.tex").read_text(encoding="utf-8") == "years of work"
 
 
@@ -604,12 +604,12 @@ def test_an_accident_leaves_the_old_release_whole(fault, own, monkeypatch):
         raise fault
 
     monkeypatch.setattr(release_module, "write_sums", fail)
-    with pytest.raises((OSError, KeyboardInterrupt)) as told:
+    with pytest.raises((OSError, KeyboardInterrupt)) as caught:
         _release(own, own / FOLDER, **asked, with_truth=True)
-    said = (
+    message = (
         "(No space left on device): check the free space and your rights, and release again; a release that was there"
     )
-    assert isinstance(fault, KeyboardInterrupt) or said in str(told.value)
+    assert isinstance(fault, KeyboardInterrupt) or message in str(caught.value)
     assert {path: path.read_bytes() for path in _files(own / FOLDER)} == before
     assert sorted(path.name for path in own.iterdir() if "partial" in path.name or "replaced" in path.name) == []
 
@@ -640,5 +640,5 @@ def test_queries_with_pictures_are_refused_and_told_what_to_do_instead(own, mist
     images = pa.array([[frame_row(Frame(picture=b"webp", camera=camera))], *[None] * (len(table) - 1)], pa.list_(FRAME))
     at = table.schema.get_field_index("frames")
     pq.write_table(table.set_column(at, table.schema.field(at), [images]), path)
-    told = mistake("release", "--regions", RIVERSIDE, "--out", own)
-    assert "holds pictures, and a release holds none so far: name the other suites with --suites" in told
+    given = mistake("release", "--regions", RIVERSIDE, "--out", own)
+    assert "holds pictures, and a release holds none so far: name the other suites with --suites" in given

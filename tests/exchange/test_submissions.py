@@ -100,8 +100,8 @@ def write_rows(path, rows):
 
 
 def write_card(path, **changes):
-    said = {**CARD, **changes}
-    lines = [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in said.items() if value is not None]
+    values = {**CARD, **changes}
+    lines = [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in values.items() if value is not None]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
@@ -139,9 +139,9 @@ def flags(files, stored):
 def change_said(folder, change):
     """Change what `submission.json` says."""
     path = folder / "submission.json"
-    said = json.loads(path.read_text(encoding="utf-8"))
-    change(said)
-    path.write_text(json.dumps(said), encoding="utf-8")
+    record = json.loads(path.read_text(encoding="utf-8"))
+    change(record)
+    path.write_text(json.dumps(record), encoding="utf-8")
 
 
 def put_table(folder, table, **options):
@@ -172,15 +172,15 @@ def test_a_submission_says_versions_tasks_and_hashes_and_is_the_same_bytes_again
     make_submission(SubmitRequest(**files, board=stored, into=into))
     for name in ("submission.json", "predictions/mine.parquet"):
         assert (into / name).read_bytes() == (made / name).read_bytes(), name
-    said = json.loads((into / "submission.json").read_text(encoding="utf-8"))
-    assert said["board"] == "kept"
-    assert {"task_version", "data_version", "scorer_version", "made_by"} <= set(said)
-    assert {(task["suite"], task["answered"] == task["queries"]) for task in said["tasks"]} == {
+    record = json.loads((into / "submission.json").read_text(encoding="utf-8"))
+    assert record["board"] == "kept"
+    assert {"task_version", "data_version", "scorer_version", "made_by"} <= set(record)
+    assert {(task["suite"], task["answered"] == task["queries"]) for task in record["tasks"]} == {
         ("absent", True),
         ("clean", True),
     }
-    assert said["files"]["predictions/mine.parquet"] == file_record(into / "predictions/mine.parquet").model_dump()
-    assert said["attribution"].startswith("(c) OpenStreetMap contributors")
+    assert record["files"]["predictions/mine.parquet"] == file_record(into / "predictions/mine.parquet").model_dump()
+    assert record["attribution"].startswith("(c) OpenStreetMap contributors")
 
 
 def test_queries_without_a_row_are_misses_and_a_suite_without_any_is_not_asked(stored, files, rows, program):
@@ -633,10 +633,10 @@ def test_one_command_publishes_stored_results_and_submissions_and_says_what_it_l
         publish(board=stored, submissions=copied.parent, into=into, out=tmp_path)
     assert sum(line.startswith(lost) for line in lines) == 1
     words = ("--submissions", copied.parent, "--into", into, "--out", tmp_path)
-    code, said, err = program("publish", "--board", stored, *words)
+    code, out, err = program("publish", "--board", stored, *words)
     assert code == CONTESTANT_FAILED
     assert err.count(lost) == 1
-    assert said.split()[-1] == str(into / "index.html")
+    assert out.split()[-1] == str(into / "index.html")
     page = (into / "index.html").read_text(encoding="utf-8")
     assert "as submitted" in page
     assert "run here" in page

@@ -242,15 +242,15 @@ def test_queries_of_sealed_places_and_of_older_versions_are_told_before(request_
     entry = plan_entry(request_)
     assert not any("count as misses" in line for line in cost_lines(entry))
     monkeypatch.setattr(entry_cost, "read_board_manifest", lambda _: about)
-    told = "\n".join(cost_lines(entry))
-    assert "of task version 3, and this program draws version" in told
-    assert "are of sealed places, and count as misses without --sealed-seed-file" in told
+    message = "\n".join(cost_lines(entry))
+    assert "of task version 3, and this program draws version" in message
+    assert "are of sealed places, and count as misses without --sealed-seed-file" in message
 
 
 def test_a_card_of_a_submission_has_the_authors_of_the_class_and_lines_that_are_cut():
-    said = {"authors": ("A. Author",), "code": "https://example.org/mine", "uses": ("imagery",)}
+    values = {"authors": ("A. Author",), "code": "https://example.org/mine", "uses": ("imagery",)}
     made = entering._card_of(
-        replace(Middle.card, source="word " * 100, limits="word " * 100, **said), [], None, source="mine"
+        replace(Middle.card, source="word " * 100, limits="word " * 100, **values), [], None, source="mine"
     )
     assert made.source.endswith(" ...")
     assert len(made.limits) <= 300
@@ -332,12 +332,12 @@ def test_a_round_that_was_cut_goes_on_where_it_was(request_, entered, tmp_path, 
 
 def test_who_fails_on_every_query_has_no_submission_and_an_example_of_it_on_one_line(request_, tmp_path):
     request = replace(request_, matcher=f"{__name__}:Lost")
-    with pytest.raises(MatchError) as told:
+    with pytest.raises(MatchError) as caught:
         enter(plan_entry(request), into=tmp_path / "lost")
-    said = (
-        r"lost failed on all (\d+) queries \(\1 ended as crash, the first with the message [\"'].*no road.*near \w+.*"
+    text = r"lost failed on all (\d+) queries \(\1 ended as crash, the first with the text [\"'].*no road.*near \w+.*"
+    assert re.fullmatch(
+        rf"{text}\): mend it, raise its version and enter again; \S+lost is as it was", str(caught.value)
     )
-    assert re.fullmatch(rf"{said}\): mend it, raise its version and enter again; \S+lost is as it was", str(told.value))
     assert not (tmp_path / "lost").exists()
 
 

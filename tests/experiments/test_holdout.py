@@ -67,11 +67,11 @@ def requests_of(plan):
 def test_train_places_teach_calibration_places_fit_rejectors_and_test_places_are_ranked(plan_of, lay_towns, tmp_path):
     lay_towns(tmp_path / "out", TRAIN, CALIBRATION, TEST)
     plan = plan_of()
-    told = plan.to_text().splitlines()
-    learning = told.index(
+    lines = plan.to_text().splitlines()
+    learning = lines.index(
         "  learning: calibration and test places are asked after learning from train places (clean, at most 5 queries)"
     )
-    assert told[learning + 1 : learning + 5] == [
+    assert lines[learning + 1 : learning + 5] == [
         f"    train: 1 place ({TRAIN})",
         f"    calibration: 1 place ({CALIBRATION})",
         f"    test: 1 place ({TEST})",
@@ -110,12 +110,12 @@ def test_on_train_places_only_suites_to_learn_from_are_drawn(plan_of):
 
 
 def test_without_learning_train_places_are_left_out_in_one_line(plan_of):
-    told = []
+    lines = []
     text = TEXT[TEXT.index("[learning]") :]
-    with reporting(told.append):
+    with reporting(lines.append):
         found = requests_of(plan_of(**{text: "", '"learners:Counts", "learners:Oracle", ': ""}))
     assert {name for _, name in found} == {CALIBRATION, TEST}
-    assert told == [f"nothing learns, so train places are left out: {TRAIN}"]
+    assert lines == [f"nothing learns, so train places are left out: {TRAIN}"]
 
 
 def test_controls_are_drawn_where_nothing_trains(plan_of, tmp_path, monkeypatch):

@@ -70,17 +70,17 @@ def small(**changes):
 def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     out = lay_towns(tmp_path_factory.mktemp("pipeline") / "out", "town-suburb")
     plan = plan_pipeline(small(), out=out)
-    told = plan.to_text().splitlines()
-    assert told[1:3] == [
+    given = plan.to_text().splitlines()
+    assert given[1:3] == [
         "  queries: 0 of 1 task up to date, 1 to be drawn (1 not there yet), at most 28 queries",
         "    to be drawn: clean on town-suburb",
     ]
-    assert told[3].startswith("  controls: 0 of 1 task up to date, 1 to be drawn (1 not there yet), at most ")
-    assert "  run: 4 matchers, 0 answered, 0 to ask" in told
+    assert given[3].startswith("  controls: 0 of 1 task up to date, 1 to be drawn (1 not there yet), at most ")
+    assert "  run: 4 matchers, 0 answered, 0 to ask" in given
     assert any(
         line.startswith("    fft_vote (controls alone): 0 answered, 0 to ask, and at most ")
         and line.endswith(" to be drawn; 0 answered there before")
-        for line in told
+        for line in given
     )
     lines = []
     with threaded(), reporting(lines.append):
@@ -160,9 +160,9 @@ def test_the_command_ends_with_the_board_and_what_to_do_next(made, program, monk
     _, board, _ = made
     monkeypatch.setattr("sasgeo_bench.cli.boards.run_pipeline", lambda *_, **__: board)
     (tmp_path / "small.toml").write_text(TEXT, encoding="utf-8")
-    code, told, err = program("leaderboard", "small.toml")
+    code, out, err = program("leaderboard", "small.toml")
     assert code == 0, err
-    assert told.splitlines()[-1] == str(Path("out") / "boards" / "small")
+    assert out.splitlines()[-1] == str(Path("out") / "boards" / "small")
     assert err.splitlines()[-1].startswith("next: sasgeo-bench leaderboard small.toml --matcher NAME adds one of yours")
 
 
@@ -178,13 +178,13 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
         f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")
     ]
     assert again.board.leaderboard.equals(board.board.leaderboard)
-    told = plan.to_text()
-    assert "  queries: 1 of 1 task up to date\n  controls: 1 of 1 task up to date\n" in told
+    text = plan.to_text()
+    assert "  queries: 1 of 1 task up to date\n  controls: 1 of 1 task up to date\n" in text
     count = len(board.scores["random"]) + len(
         task_files.Task.open(plan.out / "tasks" / "controls" / "town-suburb+controls").ids()
     )
-    assert f"    random: {count} answered, 0 to ask\n" in told
-    assert "to be drawn" not in told
+    assert f"    random: {count} answered, 0 to ask\n" in text
+    assert "to be drawn" not in text
 
 
 def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):
@@ -211,13 +211,13 @@ def test_what_changes_queries_has_them_drawn_anew(made, changes, tmp_path):
 
 def test_a_dry_run_tells_why_tasks_are_drawn_anew_and_how_many_answers_that_leaves(made):
     plan, board, _ = made
-    told = plan_pipeline(small(**{"sites = 1": "sites = 2"}), out=plan.out).to_text()
+    text = plan_pipeline(small(**{"sites = 1": "sites = 2"}), out=plan.out).to_text()
     assert (
-        "  queries: 0 of 1 task up to date, 1 to be drawn (1 drawn with sites = 1, now 2), at most 56 queries" in told
+        "  queries: 0 of 1 task up to date, 1 to be drawn (1 drawn with sites = 1, now 2), at most 56 queries" in text
     )
     count = len(board.scores["random"])
-    assert f"to be drawn; {count} answered there before\n" in told
-    assert "answers where they are: those to the same queries count again, the others are set aside\n" in told
+    assert f"to be drawn; {count} answered there before\n" in text
+    assert "answers where they are: those to the same queries count again, the others are set aside\n" in text
 
 
 def test_a_task_of_its_own_regions_is_drawn_on_these_alone(tmp_path):
@@ -378,10 +378,10 @@ def test_a_file_of_the_paper_keeps_the_hash_that_it_had_before_there_were_readin
 def test_a_reading_of_the_crop_is_a_suite_that_all_matchers_are_asked_on_and_contrasts_name(tmp_path):
     text = PAPER.replace("trials = 3", 'trials = 3\ncrop_readings = ["absent"]')
     spec = parse_toml(text.replace('["paper-poc"]', '["paper-poc-crop-absent"]'), PipelineFile, source="few.toml")
-    said = plan_pipeline(spec, out=tmp_path).to_text()
-    assert "3 trials of each seed: 0 of 4 tasks up to date" in said
+    given = plan_pipeline(spec, out=tmp_path).to_text()
+    assert "3 trials of each seed: 0 of 4 tasks up to date" in given
     for suite in ("paper-poc", "paper-poc-crop-absent"):
-        assert f"to be drawn: {suite} on paper-poc-43" in said
+        assert f"to be drawn: {suite} on paper-poc-43" in given
     wrong = text.replace('["paper-poc"]', '["paper-poc-crop-absent"]').replace('track = "retrieval"', "")
     with pytest.raises(ConfigError, match="the paper's trials are retrieval"):
         parse_toml(wrong, PipelineFile, source="few.toml")
@@ -461,11 +461,11 @@ def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_its
     assert board.board.leaderboard.loc[board.board.leaderboard["matcher"] == "oracle_counts", "is_control"].all()
     text = (tmp_path / "boards" / "taught" / "leaderboard.md").read_text(encoding="utf-8")
     assert "trained on 5 queries of 1 place (town-suburb)." in text
-    told = plan.to_text().splitlines()
-    assert "  learning: each half is asked after learning from the other (clean, at most 5 queries)" in told
-    assert "    learners:Oracle: from the half itself, never ranked" in told
-    assert "      half a: trained on 5 queries of 1 place (town-agricultural)" in told
-    assert "      half b: trained on 5 queries of 1 place (town-suburb)" in told
+    lines = plan.to_text().splitlines()
+    assert "  learning: each half is asked after learning from the other (clean, at most 5 queries)" in lines
+    assert "    learners:Oracle: from the half itself, never ranked" in lines
+    assert "      half a: trained on 5 queries of 1 place (town-agricultural)" in lines
+    assert "      half b: trained on 5 queries of 1 place (town-suburb)" in lines
 
 
 @pytest.mark.parametrize(
@@ -504,8 +504,8 @@ def test_a_half_without_a_place_is_told_before_anything_is_asked(tmp_path):
     both = plan_pipeline(taught_by(""), out=tmp_path)
     assert "has no place here" not in "\n".join(both.training_groups.lines(both.requests))
     one = plan_pipeline(taught_by("", LEARNING.replace('"town-suburb", ', "")), out=tmp_path)
-    told = one.training_groups.lines(one.requests)
-    assert [line for line in told if "has no place here" in line] == [
+    given = one.training_groups.lines(one.requests)
+    assert [line for line in given if "has no place here" in line] == [
         "    half a has no place here: none learns for half b"
     ]
 
@@ -514,7 +514,7 @@ def test_a_key_that_is_newer_than_a_file_leaves_its_hash_as_it_was():
     assert small().sha256 == "9776e35b91281bb01fef8fc443a2ccf8787e231e33617e88657f853beb9acb0e"
     metric = '[[contrast]]\nmetric = "interaction"'
     one, other = (
-        small(**{"[[contrast]]": f"{metric}\npilot = {{ {said} }}"}) for said in ("second = -0.3", "control = 1")
+        small(**{"[[contrast]]": f"{metric}\npilot = {{ {each} }}"}) for each in ("second = -0.3", "control = 1")
     )
     assert one.sha256 == "7ba551d4b9660e7e2e58a49f80793bdcc86237fabf73b57b3e155363bb0c8f0b"
     changed = [
@@ -598,8 +598,8 @@ def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
 )
 def test_a_rehearsal_asks_what_the_experiment_asks(small, large, may_differ):
     one, other = (read_pipeline_file(find_pipeline_file(name)).model_dump() for name in (small, large))
-    for said in (one, other):
-        for item in said["task"]:
+    for each in (one, other):
+        for item in each["task"]:
             item.pop("sites")
     assert {name for name in one if one[name] != other[name]} <= may_differ
     assert one["contrast"]

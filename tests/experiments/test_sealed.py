@@ -71,10 +71,10 @@ def about_board(out):
 @pytest.mark.slow
 def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_it(split, tmp_path, lay_towns):
     out = lay_towns(tmp_path / "out", OPEN, SEALED)
-    told = []
-    with reporting(told.append):
+    lines = []
+    with reporting(lines.append):
         plan = plan_of(split, out)
-    assert told == [
+    assert lines == [
         f"sealed places of split 'towns-alone' are left out: {SEALED} (leaderboard --sealed-seed-file opens them)"
     ]
     assert f"  sealed {SEALED}: left out, not opened (--sealed-seed-file opens it)" in plan.to_text().splitlines()
@@ -174,11 +174,11 @@ def test_the_command_opens_by_a_file_that_its_owner_alone_can_read(split, tmp_pa
     path.write_text(SEED.text, encoding="ascii")
     path.chmod(0o600)
     asked = ("leaderboard", "closed.toml", "--dry-run", "--sealed-seed-file", path)
-    code, told, err = program(*asked)
+    code, out, err = program(*asked)
     assert code == 0, err
-    assert f"sealed {SEALED}: to be opened, by seed {SEED.commitment[:12]}" in told
+    assert f"sealed {SEALED}: to be opened, by seed {SEED.commitment[:12]}" in out
     assert f"sealed places are drawn by a seed of 128 bits, commitment {SEED.commitment[:12]}" in err
-    assert SEED.text not in told + err
+    assert SEED.text not in out + err
     code, _, err = program(*asked, "--opened", "yesterday")
     assert (code, err.strip()) == (2, "sasgeo-bench: --opened must be a date as in 2021-10-28, got 'yesterday'")
     code, _, err = program(*asked, "--opened", "2999-01-01")

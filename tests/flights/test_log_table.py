@@ -170,14 +170,14 @@ def test_a_log_of_any_format_is_the_same_flight(tmp_path, head, row, height_m, y
     ],
 )  # fmt: skip
 def test_what_is_no_place_or_no_value_is_left_out_with_a_word(tmp_path, head, row, expected, left_out) -> None:
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         if expected is None:
             with pytest.raises(FlightError, match="two points at least, the log has 0"):
                 _read(tmp_path, head, row)
         else:
             _check(_read(tmp_path, head, row, name="a.pos" if head == POS else "log.csv"), **expected)
-    assert [str(one.message).partition(": ")[2] for one in told] == left_out
+    assert [str(one.message).partition(": ")[2] for one in caught] == left_out
 
 
 @pytest.mark.filterwarnings("ignore:.*no line has a yaw")

@@ -102,7 +102,7 @@ def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(written, mod
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "told"),
+    ("name", "text", "expected"),
     [
         ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>"), "elevations, which are above the sea"),
         ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"), "altitudes, which are not relative to the ground"),
@@ -113,13 +113,13 @@ def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(written, mod
         ("d.csv", "lat,lon," + ",".join(f"c{at:0>99}" for at in range(99)), "'c000"),
     ],
 )  # fmt: skip
-def test_what_of_a_file_is_not_read_is_told_in_one_line(written: Callable, name: str, text: str, told: str) -> None:
+def test_what_of_a_file_is_not_read_is_told_in_one_line(written: Callable, name: str, text: str, expected: str) -> None:
     if name == "d.csv":
         text += "".join(f"\n1,{at + 1}" + ",5" * 99 for at in range(2))
     last = read_log(
         written(name, text), LogFacts(time_unit="none") if name in ("a.csv", "c.csv", "d.csv") else None
     ).notes[-1]
-    assert last.startswith(f"not read: {told}")
+    assert last.startswith(f"not read: {expected}")
     assert last.isprintable()
     assert len(last) < 600
 
@@ -256,9 +256,9 @@ def test_points_before_the_first_fix_and_of_one_time_or_place_are_left_out_with_
     """Logs of PX4 and ArduPilot begin at 0, 0; those with times in whole seconds repeat them."""
     rows = [f"{at // 2},{LAT + at * 5e-5 if at > 3 else 0},{LON if at > 3 else 0},8" for at in range(20)]
     path = written("a.csv", _csv("time_s,lat,lon,height_m", *rows))
-    with pytest.warns(UserWarning, match=r"a\.csv: left out") as told:
+    with pytest.warns(UserWarning, match=r"a\.csv: left out") as caught:
         log = read_log(path)
-    assert [str(each.message) for each in told] == [
+    assert [str(each.message) for each in caught] == [
         "a.csv: left out 4 points at 0, 0 before the first fix",
         "a.csv: left out 8 points with the time of the point before",
     ]

@@ -51,7 +51,7 @@ def test_arrays_are_its_own_and_read_only() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         ({"time_s": [0.0, 0.0]}, "time does not increase after pose 1"),
         ({"position_m": [[0, 0, 0], [math.nan, 0, 0]]}, "position_m of pose 2 is not finite"),
@@ -59,8 +59,8 @@ def test_arrays_are_its_own_and_read_only() -> None:
         ({"time_s": [], "position_m": np.empty((0, 3)), "yaw_deg": []}, "one pose at least"),
     ],
 )
-def test_impossible_values_are_refused(changes: dict[str, object], told: str) -> None:
-    with pytest.raises(FlightError, match=told):
+def test_impossible_values_are_refused(changes: dict[str, object], expected: str) -> None:
+    with pytest.raises(FlightError, match=expected):
         _straight(**changes)
 
 

@@ -50,9 +50,9 @@ def at(east_m, north_m, yaw_deg=0.0, confidence=None):
 
 
 def view(frame, increment=(0.0, 50.0, 0.0), *, prior=NOTHING):
-    told = frame > 0 and increment is not None
-    covariance = COVARIANCE if told else None
-    step = Step(sequence_id="f", frame=frame, increment=increment if told else None, covariance=covariance)
+    given = frame > 0 and increment is not None
+    covariance = COVARIANCE if given else None
+    step = Step(sequence_id="f", frame=frame, increment=increment if given else None, covariance=covariance)
     return Query(
         query_id=f"f{frame:06x}",
         track="sequence",

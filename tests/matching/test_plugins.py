@@ -163,8 +163,8 @@ def test_a_matcher_is_made_by_its_name_and_listed_with_where_it_comes_from(own) 
 def test_a_card_that_is_not_named_as_its_entry_point_is_refused(own) -> None:
     """Else its rows stand under a name that no command knows."""
     own(another="mine:Sound")
-    said = refusal("another")
-    assert said.startswith("another: its card is named 'sound', and rows are found by one name: give the entry point")
+    fault = refusal("another")
+    assert fault.startswith("another: its card is named 'sound', and rows are found by one name: give the entry point")
 
 
 def test_a_fault_of_a_card_is_told_with_file_key_and_mend(own, install, tmp_path) -> None:
@@ -174,9 +174,9 @@ def test_a_fault_of_a_card_is_told_with_file_key_and_mend(own, install, tmp_path
     path = tmp_path / "a-carded" / "card.toml"
     path.write_text(example_card("carded").replace("licence", "license"), encoding="utf-8")
     for spec in ("carded", "carded:Carded"):
-        said = refusal(spec)
-        assert said.startswith(f"{spec}: {path}: unknown key 'license', did you mean 'licence'?; 'licence' is missing")
-        assert said.endswith(": correct it there (submit --example-card prints a sound one)")
+        fault = refusal(spec)
+        assert fault.startswith(f"{spec}: {path}: unknown key 'license', did you mean 'licence'?; 'licence' is missing")
+        assert fault.endswith(": correct it there (submit --example-card prints a sound one)")
     path.write_text(example_card("carded").replace("tracks =", "# tracks ="), encoding="utf-8")
     assert refusal("carded") == f"carded: {path}: tracks is empty, name retrieval, localization or both"
 
@@ -186,11 +186,11 @@ def test_of_two_with_one_name_the_built_in_one_wins_and_both_are_named(install, 
     # By name alone the outsider would come first, by the place on the import path too.
     install(ours, {"sound": "built_in:Sound"}, built_in=SOUND)
     install("an-outsider", {"sound": "outside:Sound"}, outside=SOUND)
-    with pytest.warns(UserWarning, match="two plugins are named 'sound'") as told:
+    with pytest.warns(UserWarning, match="two plugins are named 'sound'") as caught:
         points = list_entry_points()
     assert points["sound"].value == "built_in:Sound"
-    (said,) = (str(item.message) for item in told)
-    assert f"{ours} is used, an-outsider (outside:Sound) is not" in said
+    (message,) = (str(item.message) for item in caught)
+    assert f"{ours} is used, an-outsider (outside:Sound) is not" in message
     with pytest.warns(UserWarning, match="two plugins"):
         assert type(load_matcher("sound")).__module__ == "built_in"
 
@@ -316,11 +316,11 @@ def test_what_is_wrong_with_a_plugin_is_told_in_one_line(own, install, value, wo
         raises='raise OSError("weights.bin is\\n missing")',
         leaves="raise SystemExit(0)",
     )
-    told = refusal("wrong")
-    assert told.startswith("wrong: ")
-    assert words in told
+    message = refusal("wrong")
+    assert message.startswith("wrong: ")
+    assert words in message
     if "imported" in words:
-        assert f"{value} of x-own" in told
+        assert f"{value} of x-own" in message
     # One that is broken costs the others nothing.
     assert load_matcher("sound").card.name == "sound"
     assert "wrong" in list_entry_points()
@@ -329,14 +329,14 @@ def test_what_is_wrong_with_a_plugin_is_told_in_one_line(own, install, value, wo
 def test_a_misspelt_name_gets_a_proposal_and_one_like_no_other_none(own) -> None:
     own()
     for name in ("rastr_uniform", "raster-uniform", "raster_uniforms"):
-        told = refusal(name)
-        assert f"there is no matcher {name!r}, did you mean 'raster_uniform'?" in told
-        assert "list matchers" in told
+        message = refusal(name)
+        assert f"there is no matcher {name!r}, did you mean 'raster_uniform'?" in message
+        assert "list matchers" in message
     for name in ("", "something-else-altogether", "../x", "two\nlines"):
-        told = refusal(name)
-        assert f"there is no matcher {name!r}" in told
-        assert "did you mean" not in told
-        assert "module:Class" in told
+        message = refusal(name)
+        assert f"there is no matcher {name!r}" in message
+        assert "did you mean" not in message
+        assert "module:Class" in message
 
 
 # --- module:Class ---------------------------------------------------------------------------------------------------
@@ -365,9 +365,9 @@ def test_a_class_of_a_module_needs_no_entry_point(own) -> None:
 )
 def test_what_is_wrong_with_a_module_or_a_class_is_told_in_one_line(own, spec, words) -> None:
     own()
-    told = refusal(spec)
-    assert told.startswith(f"{spec}: ")
-    assert words in told
+    message = refusal(spec)
+    assert message.startswith(f"{spec}: ")
+    assert words in message
 
 
 @pytest.mark.parametrize("kind", ["matcher", "rejector"])

@@ -107,8 +107,8 @@ def test_a_segmenter_that_is_written_learns_to_tell_roofs_from_the_rest() -> Non
     exec(package_files("segmenter", "my-segmenter")["src/my_segmenter/segmenter.py"], found)  # noqa: S102 - our own text
     *train, test = tiny_images()
     segmenter = found["MySegmenter"]()
-    said = segmenter.segment(test.image, learned=segmenter.learn(ImageTraining(images=train)))
-    roof, at = said.probabilities()[said.classes.index("building")], test.classes.index("building")
+    given = segmenter.segment(test.image, learned=segmenter.learn(ImageTraining(images=train)))
+    roof, at = given.probabilities()[given.classes.index("building")], test.classes.index("building")
     assert roof[test.labels[at] == 1].mean() > 0.8
     assert roof[test.labels[at] == 0].mean() < 0.3
     assert np.isnan(segmenter.segment(test.image, learned=None).probabilities()).all()
@@ -161,9 +161,9 @@ def test_a_folder_that_is_not_empty_or_a_file_in_the_way_is_refused_and_left_alo
 
 def test_a_file_above_the_folder_is_told_in_one_line(tmp_path) -> None:
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(StoreError, match="cannot be written") as told:
+    with pytest.raises(StoreError, match="cannot be written") as caught:
         write_plugin(tmp_path / "file" / "plugin", package_files("matcher", "my-matcher"))
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
     assert [item.name for item in tmp_path.iterdir()] == ["file"]
 
 

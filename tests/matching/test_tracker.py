@@ -17,7 +17,7 @@ HERE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0)
 
 
 @pytest.mark.parametrize(
-    ("fix", "told"),
+    ("fix", "expected"),
     [
         ("a text", "step() returned str"),
         (Fix(pose=None), "say is_accepted=False"),
@@ -40,10 +40,10 @@ HERE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0)
         (Fix(pose=HERE, confidence=7.0), "confidence is 7"),
     ],
 )
-def test_a_fix_that_is_none_is_refused(fix, told):
+def test_a_fix_that_is_none_is_refused(fix, expected):
     with pytest.raises(MatchError) as caught:
         check_fix(fix, top_k=5)
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -67,11 +67,11 @@ def test_the_covariance_of_many_steps_is_that_of_drawn_ones():
     """To first order: the spread of drawn ways is what `advance` says, in place, heading, and between them."""
     rng = np.random.default_rng(3)
     step_cov = np.diag([0.5, 1.0, 0.25])
-    told = tuple(step_cov.ravel().tolist())
+    lines = tuple(step_cov.ravel().tolist())
     count = 20
     pose, covariance = HERE, np.diag([4.0, 4.0, 1.0])
     for frame in range(1, count + 1):
-        step = Step(sequence_id="f", frame=frame, increment=(2.0, 30.0, 5.0), covariance=told)
+        step = Step(sequence_id="f", frame=frame, increment=(2.0, 30.0, 5.0), covariance=lines)
         pose, covariance = advance(pose, covariance, step)
     start = rng.normal(size=(3, 20_000)) * np.sqrt([[4.0], [4.0], [1.0]])
     place, yaw_deg = HERE.easting_m + start[0] + 1j * (HERE.northing_m + start[1]), HERE.yaw_deg + start[2]

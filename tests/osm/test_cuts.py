@@ -94,10 +94,10 @@ def test_the_build_says_in_a_line_what_is_unknown_and_the_region_holds_it(tmp_pa
     text = {"id": "cut", "title": "Cut", "scenes": ["urban"], "center_lonlat": (9.0, 47.0), "size_m": (512, 512)}
     spec = RegionFile(**text, cell_size_m=1.0, extract=[extract])
     plan = plan_build(spec, out=tmp_path / "out", extract_folders=[tmp_path])
-    told = []
-    with reporting(told.append):
+    lines = []
+    with reporting(lines.append):
         manifest = build_region(plan)
-    (line,) = [line for line in told if "mapped" in line]
+    (line,) = [line for line in lines if "mapped" in line]
     assert "(header box)" in line
     assert "ways that lack some nodes 40, ways that lack all nodes 2" in line
     assert f"{manifest.coverage.unknown_m2[CUT]:,.0f} m2 unknown {CUT}" in line

@@ -226,8 +226,8 @@ def test_features_of_one_object_are_its_parts(tmp_path):
 )
 def test_a_closed_way_that_comes_as_a_line_and_as_an_area_is_one_object(tags, classes, tmp_path):
     turned = shapely.LineString([*HOUSE.exterior.coords[2:], *HOUSE.exterior.coords[1:3]])
-    said = {key: value for key, value in tags.items() if key != "name"}  # with other tags it is another object
-    both = [feature(shapely.MultiPolygon([HOUSE]), **tags), feature(turned, **said)]
+    values = {key: value for key, value in tags.items() if key != "name"}  # with other tags it is another object
+    both = [feature(shapely.MultiPolygon([HOUSE]), **tags), feature(turned, **values)]
     reading = read(written(tmp_path / "a.geojson", *both, feature(SHED)), tags={}, classes=None)
     assert reading.features["class"].tolist() == classes
     assert reading.drops == {"Polygon without a class": 1}

@@ -106,7 +106,7 @@ def test_a_full_history_is_cut_at_each_date(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("names", "at", "told"),
+    ("names", "at", "expected"),
     [
         (["a-2014-01-01.osm"], [], "at least 2 dated states, got 1"),
         (["a-2014-01-01.osm", "b-2014-01-01.osm"], [], "two states have the date 2014-01-01"),
@@ -118,11 +118,11 @@ def test_a_full_history_is_cut_at_each_date(tmp_path):
         (["a.txt", "b-2014-01-01.osm"], [], "of no known format"),
     ],
 )
-def test_what_cannot_be_put_in_order_is_told_in_one_line(names, at, told, tmp_path):
+def test_what_cannot_be_put_in_order_is_told_in_one_line(names, at, expected, tmp_path):
     for name in names:
         if not name.startswith("none"):
             osm(tmp_path / name, (1, {"building": "yes"}, square(1, 1)))
-    with pytest.raises((ConfigError, ExtractError), match=told) as caught:
+    with pytest.raises((ConfigError, ExtractError), match=expected) as caught:
         date_extracts([tmp_path / name for name in names], at=at)
     assert "\n" not in str(caught.value)
 

@@ -91,11 +91,11 @@ def test_new_objects_with_negative_ids_are_assembled_have_the_id_of_their_relati
 
 def test_open_outer_ways_are_dropped_only_if_nothing_is_made_of_them(tmp_path):
     members = ((1, "outer"), (2, "outer"))
-    told = read_extract(write(tmp_path / "a.osm", [(SOUTH, FOREST), (NORTH, FOREST)], (members, BARE)), GRID).drops
-    assert not told
+    given = read_extract(write(tmp_path / "a.osm", [(SOUTH, FOREST), (NORTH, FOREST)], (members, BARE)), GRID).drops
+    assert not given
     ways = [(SOUTH, FOREST), (NORTH, ROAD), (BESIDE, HOUSE)]
-    told = read_extract(write(tmp_path / "b.osm", ways, (members, BARE)), GRID).drops
-    assert told == {"open way with the area key 'landuse', anywhere in the extract": 1}
+    given = read_extract(write(tmp_path / "b.osm", ways, (members, BARE)), GRID).drops
+    assert given == {"open way with the area key 'landuse', anywhere in the extract": 1}
 
 
 def test_roles_that_are_missing_are_told_by_the_place(tmp_path):

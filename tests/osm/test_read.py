@@ -324,7 +324,7 @@ def test_a_real_file_out_of_order_is_read_whole(real_extracts):
 
 
 @pytest.mark.parametrize(
-    ("at", "newest", "header", "count", "said"),
+    ("at", "newest", "header", "count", "expected"),
     [
         ((1999, 1, 1), (2013, 7, 19), None, 1, "holds an object of 2013-07-19"),
         ((2013, 7, 17), (2013, 7, 19), None, 5000, None),
@@ -334,13 +334,13 @@ def test_a_real_file_out_of_order_is_read_whole(real_extracts):
         ((2024, 1, 1), None, None, 5000, None),
     ],
 )
-def test_a_file_is_held_against_the_day_that_is_stated(at, newest, header, count, said):
+def test_a_file_is_held_against_the_day_that_is_stated(at, newest, header, count, expected):
     days = [None if day is None else dt.date(*day) for day in (newest, header)]
-    told = misdated("a.osm", dt.date(*at), newest=days[0], header=days[1], count=count)
-    assert told is None if said is None else said in told
+    given = misdated("a.osm", dt.date(*at), newest=days[0], header=days[1], count=count)
+    assert given is None if expected is None else expected in given
 
 
 @pytest.mark.parametrize(("year", "is_reported"), [(1999, True), (None, False)])
 def test_a_wrong_date_of_an_extract_is_a_warning(toytown, toygrid, year, is_reported):
     at = None if year is None else dt.date(year, 1, 1)
-    assert any("state the day" in told for told in read_extract(toytown, toygrid, at=at).warnings) == is_reported
+    assert any("state the day" in each for each in read_extract(toytown, toygrid, at=at).warnings) == is_reported

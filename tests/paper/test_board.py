@@ -111,8 +111,8 @@ def test_several_seeds_are_resampled_by_seed_one_by_its_tiles(made):
         summary = pd.read_parquet(board_folder(name) / "paper.parquet")
         assert set(summary["cluster"]) == {cluster}
         assert summary["clusters"].max() <= blocks
-        said = json.loads((board_folder(name) / "board.json").read_text(encoding="utf-8"))
-        assert said["by_region"] == (["paper-poc", "paper-poc-crop-smaller"] if cluster == "seed" else [])
+        record = json.loads((board_folder(name) / "board.json").read_text(encoding="utf-8"))
+        assert record["by_region"] == (["paper-poc", "paper-poc-crop-smaller"] if cluster == "seed" else [])
     assert set(board.scores["random"]["block"]) == {"paper-poc-42", "paper-poc-43"}
     rows = board.board.leaderboard[
         (board.board.leaderboard["stratum"] == "all") & (board.board.leaderboard["suite"] == "paper-poc")

@@ -42,11 +42,11 @@ def prose(text: str) -> str:
 
 
 def test_every_row_of_seed_42_is_that_of_the_board(readings):
-    told = paper_markdown(readings, [], ABOUT, {})
+    given = paper_markdown(readings, [], ABOUT, {})
     found = rows(part("Seed 42"))
     assert len(found) == len(PUBLISHED)
     for row in found:
-        assert f"\n{row} 220 |" in told
+        assert f"\n{row} 220 |" in given
 
 
 def test_every_row_of_the_crop_is_that_of_the_board(readings):
@@ -54,8 +54,8 @@ def test_every_row_of_the_crop_is_that_of_the_board(readings):
     expected = []
     for item in PUBLISHED:
         cells = [table.loc[(item.title, "recall_1", crop)] for crop in CROPS]
-        told = [f"{cell['value']:.3f} [{cell['lo']:.3f}, {cell['hi']:.3f}]" for cell in cells]
-        expected.append(f"| {item.title} | {item.recall_1:.3f} | {' | '.join(told)} |")
+        lines = [f"{cell['value']:.3f} [{cell['lo']:.3f}, {cell['hi']:.3f}]" for cell in cells]
+        expected.append(f"| {item.title} | {item.recall_1:.3f} | {' | '.join(lines)} |")
     inside = readings[readings["paper"].notna()].groupby("crop")["is_within"].sum()
     expected.append(f"| of 15 figures inside | | {' | '.join(str(inside[crop]) for crop in CROPS)} |")
     assert rows(part("Cropped cells")) == expected
@@ -70,11 +70,11 @@ def test_what_is_said_of_the_crop_follows_from_the_board(readings):
 
 
 def test_every_row_of_the_decoys_is_that_of_the_table(decoys):
-    told = decoys_markdown(decoys)
+    given = decoys_markdown(decoys)
     found = rows(part("Decoys and descriptors"))
     assert len(found) > 5
     for row in found:
-        assert f"\n{row.removesuffix(' |')} of 3 |" in told
+        assert f"\n{row.removesuffix(' |')} of 3 |" in given
 
 
 def test_what_is_said_of_the_decoys_follows_from_the_table(decoys):

@@ -158,10 +158,10 @@ def test_the_tables_open_with_pandas_and_geopandas_alone(there):
 def test_a_second_build_is_skipped_and_says_so(there, tmp_path):
     plan, _ = there
     stamp = (plan.folder / "region.json").stat().st_mtime_ns
-    told: list[str] = []
-    with reporting(told.append):
+    lines: list[str] = []
+    with reporting(lines.append):
         build_region(plan_build(small(), out=tmp_path))
-    assert told == ["town-suburb: up to date, nothing to do"]
+    assert lines == ["town-suburb: up to date, nothing to do"]
     assert (plan.folder / "region.json").stat().st_mtime_ns == stamp
 
 

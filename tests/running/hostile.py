@@ -73,8 +73,8 @@ class TellsProcess(Plain):
             self.readable += 1
 
     def match(self, query, *, top_k):
-        told = {"process": self.token, "maps": float(self.maps), "readable maps": float(self.readable)}
-        return Match(poses=(), scores=(), diagnostics=told)
+        values = {"process": self.token, "maps": float(self.maps), "readable maps": float(self.readable)}
+        return Match(poses=(), scores=(), diagnostics=values)
 
 
 class Works(Plain):

@@ -28,13 +28,13 @@ class Counts:
         self.learned = {"pairs": -1} if learned is None else json.loads(learned)
 
     def match(self, query, *, top_k):
-        told = {"pairs": float(self.learned["pairs"])}
+        values = {"pairs": float(self.learned["pairs"])}
         if query.candidates:
             poses = query.candidates[:top_k]
-            return Match(poses=poses, scores=[0.0] * len(poses), diagnostics=told, confidence=0.5)
+            return Match(poses=poses, scores=[0.0] * len(poses), diagnostics=values, confidence=0.5)
         x, y = query.prior.center_m or (0.0, 0.0)
         pose = Pose(easting_m=x, northing_m=y, yaw_deg=query.prior.yaw_deg or 0.0)
-        return Match(poses=[pose], scores=[0.0], diagnostics=told, confidence=0.5)
+        return Match(poses=[pose], scores=[0.0], diagnostics=values, confidence=0.5)
 
 
 class NeedsTraining(Counts):

@@ -46,8 +46,8 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
         plan_run(request_of(task, tmp_path / name, dask=dask)) for name, dask in (("one", None), ("two", "local:2"))
     )
     run(alone)
-    told = []
-    with reporting(told.append):
+    lines = []
+    with reporting(lines.append):
         report = run(spread)
     assert report.counts == {"ok": len(task_files.Task.open(task).ids())}
     assert rows(spread.parts[0].folder) == rows(alone.parts[0].folder)
@@ -55,9 +55,9 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
     assert about.isolation == RunManifest.open(alone.parts[0].folder).isolation
     assert about.prepare_s >= 0
     again = plan_run(request_of(task, tmp_path / "two", dask="local:2"))
-    with reporting(told.append):
+    with reporting(lines.append):
         assert run(again).counts == {}
-    assert "nothing left" in told[-1]
+    assert "nothing left" in lines[-1]
 
 
 @pytest.mark.slow

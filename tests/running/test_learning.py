@@ -80,9 +80,9 @@ def test_what_was_learnt_reaches_every_answer_and_is_kept_where_people_can_read_
     assert lines[1] == f"  to be trained on {count} queries of 1 place (town-grid)"
     assert report.counts == {"ok": 2}
     assert told(request, folder) == {float(count)}
-    said = RunManifest.open(folder).learned
-    assert (said.trained_on, said.pairs) == (["town-grid"], count)
-    text = (plan.run_folder / said.file).read_text(encoding="utf-8")
+    result = RunManifest.open(folder).learned
+    assert (result.trained_on, result.pairs) == (["town-grid"], count)
+    text = (plan.run_folder / result.file).read_text(encoding="utf-8")
     assert json.loads(text)["suites"] == ["alias"]
     assert plan_run(request).to_text().splitlines()[1].startswith("  trained on ")
     assert next(
@@ -269,8 +269,8 @@ def two_parts(apart_m, **changes):
         {"name": "one", "regions": ["here"], "part": "train"},
         {"name": "two", "regions": ["there", "beyond"], "part": "train"},
     ]
-    said = {"id": "near", "title": "Near", "kind": "holdout", "buffer_m": 1000.0, "reach_m": 100.0, "place": places}
-    return make_split(SplitFile.model_validate(said | changes), grids)
+    values = {"id": "near", "title": "Near", "kind": "holdout", "buffer_m": 1000.0, "reach_m": 100.0, "place": places}
+    return make_split(SplitFile.model_validate(values | changes), grids)
 
 
 def test_regions_of_one_place_and_blocks_within_the_buffer_are_refused():

@@ -128,19 +128,19 @@ def test_a_sound_class_instance_or_function_of_a_strength_keeps_every_rule(named
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "expected"),
     [
         (lambda _: None, "a NoneType"),
         (lambda view: np.ones(view.shape, dtype=int), "int64 of shape"),
         (lambda _: np.ones((2, 3), dtype=bool), "bool of shape (2, 3)"),
     ],
 )
-def test_a_mask_that_is_none_is_told_once(named, tmp_path, given, said):
+def test_a_mask_that_is_none_is_told_once(named, tmp_path, given, expected):
     one = type("Masked", (sgb.Occlusion,), {"mask": lambda _, view, __: given(view)})
-    told = [row.found for row in check_perturbation(named(one), out=tmp_path) if row.outcome == "fail"]
-    assert told[0].startswith(f"PerturbError: Masked: mask() returned {said}")
-    assert ", expected an array of bool of shape (" in told[0]
-    assert sum("mask()" in line for line in told) <= 2  # views of odd shapes are told apart
+    lines = [row.found for row in check_perturbation(named(one), out=tmp_path) if row.outcome == "fail"]
+    assert lines[0].startswith(f"PerturbError: Masked: mask() returned {expected}")
+    assert ", expected an array of bool of shape (" in lines[0]
+    assert sum("mask()" in line for line in lines) <= 2  # views of odd shapes are told apart
 
 
 def stop(_):

@@ -128,10 +128,10 @@ def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words
         value = value and [None if item is None else row["candidates"][0] | item for item in value]
     table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=prediction_files.PREDICTION_SCHEMA)
     pq.write_table(table, tmp_path / "mine.parquet")
-    told = refusal(everything, tmp_path / "mine.parquet")
-    assert "mine.parquet, row 1, is no prediction (" in told
-    assert words in told
-    assert told.endswith("'verify' says all that is wrong")
+    message = refusal(everything, tmp_path / "mine.parquet")
+    assert "mine.parquet, row 1, is no prediction (" in message
+    assert words in message
+    assert message.endswith("'verify' says all that is wrong")
 
 
 @pytest.mark.parametrize(
@@ -170,8 +170,8 @@ def test_only_runs_of_one_matcher_version_and_settings_are_merged(tmp_path, rows
     assert prediction_files.merge_runs([folders[2], write(rows)], into) == 2  # a file does not say whose it is
     whole = into.read_bytes()
     assert "never mixed" in refusal(prediction_files.merge_runs, folders[1:], into)
-    told = refusal(prediction_files.merge_runs, folders, into)
-    assert f"{folders[2]} holds answers of mine b (bb), {folders[0]} those of mine a (aa)" in told
+    message = refusal(prediction_files.merge_runs, folders, into)
+    assert f"{folders[2]} holds answers of mine b (bb), {folders[0]} those of mine a (aa)" in message
     (folders[2] / RUN).write_text('{"hash": "cc"}')
     assert "an unknown matcher (cc)" in refusal(prediction_files.merge_runs, folders, into)
     assert into.read_bytes() == whole

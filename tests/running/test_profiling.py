@@ -153,9 +153,9 @@ def test_a_page_is_written_whole_and_replaces_none_but_a_profile(slowing, tmp_pa
     assert policy in text  # else a browser leaves out its style
     assert "1 timeout" in text
     assert "OpenStreetMap contributors" in text
-    said = json.loads((tmp_path / "mine" / RECORD).read_text(encoding="utf-8"))
-    assert len(said["fixes"]) == 41
-    assert "OpenStreetMap" in said["attribution"]
+    record = json.loads((tmp_path / "mine" / RECORD).read_text(encoding="utf-8"))
+    assert len(record["fixes"]) == 41
+    assert "OpenStreetMap" in record["attribution"]
     write_profile(slowing, tmp_path / "mine")
     (tmp_path / "mine" / "notes.txt").touch()
     (tmp_path / "file").write_text("mine", encoding="utf-8")

@@ -118,12 +118,12 @@ def test_another_build_of_the_map_is_another_question(draw, own_out):
         answers.answer(plan, plan.parts, jobs=1, watch=answers.Watch())
     about = task / "task.json"
     before = task_files.Task.open(task).asked
-    (query, *_), said = task_files.Task.open(task).some(set(before)), json.loads(about.read_text())
+    (query, *_), record = task_files.Task.open(task).some(set(before)), json.loads(about.read_text())
     assert query[2] == before[query[0].query_id]
     # Of a task of an older program the hashes are reckoned, and say as much of the map as it does.
     strip(task)
     assert task_files.Task.open(task).asked == before
-    about.write_text(json.dumps(said | {"map_fingerprint": "0" * 64}))
+    about.write_text(json.dumps(record | {"map_fingerprint": "0" * 64}))
     assert not set(task_files.Task.open(task).asked.values()) & set(before.values())
 
 

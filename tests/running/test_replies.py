@@ -53,9 +53,9 @@ def received(text, kind="match", data=None, length=None):
     ours, theirs = socket.socketpair()
     with theirs, ours:
         threading.Thread(target=put, args=(theirs, (length or len(text)).to_bytes(4, "big") + bytes(4) + text)).start()
-        said, _ = wire.receive(ours, deadline=time.monotonic() + 60, most_bytes=wire.MOST_BYTES)
+        result, _ = wire.receive(ours, deadline=time.monotonic() + 60, most_bytes=wire.MOST_BYTES)
     data = data if data is not None else json.dumps(ROW).encode() if kind == "match" else b"text"
-    return Worker(spec="", reach=Reach(readable=[], hidden=[]), limits=Limits())._read(kind, said, data, nonce="7")
+    return Worker(spec="", reach=Reach(readable=[], hidden=[]), limits=Limits())._read(kind, result, data, nonce="7")
 
 
 def sound(kind, **changes):
@@ -221,10 +221,10 @@ def nearly(draw):
 
 @given(nearly(), nearly_a_row())
 def test_any_json_is_a_reply_or_one_line(case, row):
-    kind, said = case
+    kind, result = case
     try:
         data = json.dumps(row).encode() if kind == "match" else None
-        reply = received(json.dumps(said).encode(), kind, data=data)
+        reply = received(json.dumps(result).encode(), kind, data=data)
     except (MatchError, wire.Garbled) as refused:
         check_line(str(refused))
         return

@@ -204,9 +204,9 @@ def test_a_run_without_isolation_is_another_run_and_says_what_it_lacked(task, tm
     _, shut_in = run_all(request_of(task, tmp_path, limit=1))
     report, trusted = run_all(request_of(task, tmp_path, name="Raises", limit=1, is_sandboxed=False))
     assert shut_in.parent != trusted.parent
-    said = RunManifest.open(trusted).isolation
-    assert set(said) == set(RunManifest.open(shut_in).isolation) == set(PROMISES)
-    assert {words for name, words in said.items() if name != "memory"} == {"trusted code, not shut in"}
+    given = RunManifest.open(trusted).isolation
+    assert set(given) == set(RunManifest.open(shut_in).isolation) == set(PROMISES)
+    assert {words for name, words in given.items() if name != "memory"} == {"trusted code, not shut in"}
     assert list(report.messages) == ["crash"]
     same = plan_run(request_of(task, tmp_path, limit=1, is_sandboxed=False)).parts[0].folder
     assert same != shut_in

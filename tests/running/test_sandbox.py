@@ -242,8 +242,8 @@ def shut_in(place, lacking, command, *, readable=None):
             env={"PATH": "/usr/bin:/bin", "TMPDIR": str(place.scratch), "HOME": str(place.scratch)},
         )
     assert done.returncode == 0, done.stderr
-    said, *printed = done.stdout.splitlines()
-    return json.loads(said), "\n".join(printed)
+    lines, *printed = done.stdout.splitlines()
+    return json.loads(lines), "\n".join(printed)
 
 
 def can_be_made(mode):
@@ -261,7 +261,7 @@ def can_be_made(mode):
 def test_every_attack_gets_as_far_as_is_said_and_nothing_harmless_is_lost(tmp_path, stack, mode):
     place = Place(tmp_path, stack)
     before = place.state()
-    said, printed = shut_in(place, MODES[mode], [HERE / "attacks.py", json.dumps(place.told())])
+    given, printed = shut_in(place, MODES[mode], [HERE / "attacks.py", json.dumps(place.told())])
     found = json.loads(printed)
     done = {name for name, outcome in found.items() if outcome == "done"}
     through = {name for name in GETS_THROUGH if name in done}
@@ -276,8 +276,8 @@ def test_every_attack_gets_as_far_as_is_said_and_nothing_harmless_is_lost(tmp_pa
     elif mode == "nothing":
         assert place.reached() == set(place.listeners)
     truth, network, processes = SAID[mode]
-    assert (said["truth"], said["network"], said["processes"]) == (truth, network, processes)
-    assert said["scratch"] == (ON_DISC if mode in GETS_THROUGH["fill the disc"] else IN_MEMORY)
+    assert (given["truth"], given["network"], given["processes"]) == (truth, network, processes)
+    assert given["scratch"] == (ON_DISC if mode in GETS_THROUGH["fill the disc"] else IN_MEMORY)
 
 
 def needs(*modes):

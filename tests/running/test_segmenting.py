@@ -198,9 +198,9 @@ def test_the_control_answers_with_the_labels_and_starts_no_process(request_of) -
         with pytest.raises(MatchError, match="answers with labels, and this image has none"):
             run.segment(labelled.image)
         assert run.peak_bytes == 0
-    said = found.probabilities()
-    np.testing.assert_array_equal(np.isnan(said), labelled.labels == 2)
-    np.testing.assert_array_equal(said == 1, labelled.labels == 1)
+    given = found.probabilities()
+    np.testing.assert_array_equal(np.isnan(given), labelled.labels == 2)
+    np.testing.assert_array_equal(given == 1, labelled.labels == 1)
 
 
 def test_an_error_of_our_own_costs_one_image_and_is_logged(request_of, tmp_path, monkeypatch) -> None:

@@ -112,7 +112,7 @@ def test_a_fix_is_stored_with_its_covariance_and_modes(counted):
 
 
 @pytest.mark.parametrize(
-    ("way", "status", "told"),
+    ("way", "status", "expected"),
     [
         ("hangs", "timeout", "no answer within"),
         ("dies", "crash", "exit status 3"),
@@ -126,7 +126,7 @@ def test_a_fix_is_stored_with_its_covariance_and_modes(counted):
         ),
     ],
 )
-def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_path, request, way, status, told):
+def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_path, request, way, status, expected):
     if way not in ("hangs", "dies"):  # what its process does not live through
         request.getfixturevalue("in_threads")
     first = flight_id(min(task_files.Task.open(task).ids()))
@@ -134,7 +134,7 @@ def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_pa
     flights = run_of(task, tmp_path, "Failing", limits=replace(PATIENT, match_s=5.0 if way == "hangs" else 600.0))
     failed = flights.pop(first)
     assert [item.status for item in failed] == ["ok", "ok"] + [status] * (len(failed) - 2)
-    assert told in failed[2].message
+    assert expected in failed[2].message
     assert all("since frame 2 of the flight: " in item.message for item in failed[3:])
     for rows in flights.values():
         assert {item.status for item in rows} == {"ok"}

@@ -32,8 +32,8 @@ class Counting:
 
     def step(self, query):
         self.views += 1
-        told = {"views": self.views, "process": os.getpid(), "has_place": self.has_place}
-        return Fix(pose=HERE, covariance=[[4, 0, 0], [0, 4, 0], [0, 0, 1]], modes=[(HERE, 0.5)], diagnostics=told)
+        values = {"views": self.views, "process": os.getpid(), "has_place": self.has_place}
+        return Fix(pose=HERE, covariance=[[4, 0, 0], [0, 4, 0], [0, 0, 1]], modes=[(HERE, 0.5)], diagnostics=values)
 
 
 class Holding(Counting):

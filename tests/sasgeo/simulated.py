@@ -25,8 +25,8 @@ class Simulated:
 
 
 def modes_of(positions_m, by_class, **changes):
-    said = {"positions_m": np.array(positions_m, float), "by_class": np.array(by_class, float), "sigma_m": 2.0}
-    return Modes(**(said | changes))
+    values = {"positions_m": np.array(positions_m, float), "by_class": np.array(by_class, float), "sigma_m": 2.0}
+    return Modes(**(values | changes))
 
 
 def simulate(count, *, seed=0, hardness=0.5):
@@ -45,7 +45,7 @@ def simulate(count, *, seed=0, hardness=0.5):
         apart_m = rng.uniform(0, 600, (MODES, 2)) + 100.0 * np.arange(MODES)[:, None]
         modes = Modes(positions_m=apart_m, by_class=by_class, sigma_m=SIGMA_M)
         null = Null(best=float(modes.scores[0]), mean=0.0, deviation=2.0, places=500)
-        said = evidence_of(
+        given = evidence_of(
             modes,
             null=null,
             unknown_share=unknown,
@@ -53,7 +53,7 @@ def simulate(count, *, seed=0, hardness=0.5):
             graph_consistency=graph if at % 10 else None,
             information_nats=20 * (1 - unknown),
         )
-        odds = hardness - 0.5 * said["margin_nats"] + 3.0 * (unknown - 0.4) + 0.15 * (age - 6) - 3.0 * (graph - 0.5)
+        odds = hardness - 0.5 * given["margin_nats"] + 3.0 * (unknown - 0.4) + 0.15 * (age - 6) - 3.0 * (graph - 0.5)
         chance.append(1 / (1 + np.exp(-odds)))
         places = [Pose(easting_m=east, northing_m=north, yaw_deg=0.0) for east, north in apart_m.tolist()]
         candidates = tuple(zip(places, modes.scores.tolist(), strict=True))
@@ -62,7 +62,7 @@ def simulate(count, *, seed=0, hardness=0.5):
                 query_id=str(at),
                 candidates=candidates,
                 confidence=float(modes.masses[0]),
-                diagnostics=said | levels_of(modes),
+                diagnostics=given | levels_of(modes),
             )
         )
     chance = np.array(chance)

@@ -113,10 +113,10 @@ def test_every_arm_finds_a_noise_free_view(tiny, arm):
 
 def test_an_answer_tells_its_evidence_and_protection_levels(tiny, whole, drawn):
     match = whole.match(near(*first(tiny, "localization", kind="no error")), top_k=5)
-    told = set(match.diagnostics)
-    assert {"margin_nats", "null_z", "unknown_share", "map_age_years", "sigma_m"} <= told
-    assert told <= {*EVIDENCE_NAMES, *(item.name for item in PROTECTION)}
-    assert "graph_consistency" not in told  # the view has no vectors, so there is no graph
+    diagnostics = set(match.diagnostics)
+    assert {"margin_nats", "null_z", "unknown_share", "map_age_years", "sigma_m"} <= diagnostics
+    assert diagnostics <= {*EVIDENCE_NAMES, *(item.name for item in PROTECTION)}
+    assert "graph_consistency" not in diagnostics  # the view has no vectors, so there is no graph
     assert "graph_consistency" in whole.match(drawn.pairs[0][0], top_k=5).diagnostics
     assert 0 <= match.confidence <= 1
 
@@ -213,9 +213,9 @@ def training(tiny):
 def test_what_is_learnt_is_read_back_and_the_same_again(tiny, training):
     one, other = (SasgeoNoGraph().learn(training) for _ in range(2))
     assert one == other
-    said = ScorerModel.from_text(one)
-    assert said.views == sum(query.track == "localization" for query, _ in training.pairs)
-    assert set(said.classes) == set(tiny.region.classes)
+    given = ScorerModel.from_text(one)
+    assert given.views == sum(query.track == "localization" for query, _ in training.pairs)
+    assert set(given.classes) == set(tiny.region.classes)
     matcher = SasgeoNoGraph()
     matcher.prepare(tiny.region, one)
     query, truth = first(tiny, "localization", kind="no error")
@@ -243,11 +243,11 @@ def test_the_whole_scorer_learns_weights_of_the_joint_score_from_views_with_vect
 
 
 def test_the_even_graph_learns_rules_and_blend_alone(drawn):
-    said = ScorerModel.from_text(SasgeoGraph().learn(drawn))
-    hand = ScorerModel.by_hand(said.classes)
-    assert said.rules != hand.rules
-    assert said.blend != hand.blend
-    assert replace(said, rules=hand.rules, blend=hand.blend, views=0, blocks=0) == hand
+    given = ScorerModel.from_text(SasgeoGraph().learn(drawn))
+    hand = ScorerModel.by_hand(given.classes)
+    assert given.rules != hand.rules
+    assert given.blend != hand.blend
+    assert replace(given, rules=hand.rules, blend=hand.blend, views=0, blocks=0) == hand
 
 
 def test_nothing_to_learn_from_is_said_and_without_vectors_the_starting_rules_hold(training):

@@ -121,8 +121,8 @@ def quotes(sources: Mapping[str, str]) -> list[str]:
     return [
         f"{path}:{line} speaks of {found[0]!r}, which belongs to the generator"
         for path, text in sources.items()
-        for line, said in prose(text)
-        if (found := QUOTES.search(said))
+        for line, each in prose(text)
+        if (found := QUOTES.search(each))
     ]
 
 

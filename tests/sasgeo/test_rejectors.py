@@ -103,8 +103,8 @@ def test_features_are_lead_confidence_and_evidence_and_gaps_are_gaps():
     (answer,) = simulate(1).answers
     rows = features([answer, replace(answer, confidence=None, diagnostics={"null_z": 2.0})])
     assert rows.shape == (2, 2 + len(EVIDENCE_NAMES))
-    told = [name in answer.diagnostics for name in EVIDENCE_NAMES]
-    assert np.isfinite(rows[0]).tolist() == [True, True, *told]
+    lines = [name in answer.diagnostics for name in EVIDENCE_NAMES]
+    assert np.isfinite(rows[0]).tolist() == [True, True, *lines]
     assert np.flatnonzero(np.isfinite(rows[1])).tolist() == [0, 2 + EVIDENCE_NAMES.index("null_z")]
 
 
@@ -131,9 +131,9 @@ def test_without_a_false_fix_or_with_nothing_else_no_more_is_claimed_than_the_co
     assert found.min() == pytest.approx(upper_rate(0, 300))  # about 3 / 300
     leads = np.array([lead(item) for item in calibration.answers])
     assert (np.diff(found[np.argsort(-leads)]) >= 0).all()
-    said = remark_of(rejector)
-    assert said.startswith("0 of 300 calibration answers are false")
-    assert "ranked by margin" in said
+    result = remark_of(rejector)
+    assert result.startswith("0 of 300 calibration answers are false")
+    assert "ranked by margin" in result
     rejector.fit(calibration.answers[:50], np.ones(50, dtype=bool))
     assert rejector.p_false(calibration.answers).min() == pytest.approx(51 / 52)
     assert remark_of(rejector).startswith("50 of 50 calibration answers are false")

@@ -13,16 +13,16 @@ from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 
 
 def learnt(**changes):
-    said = json.loads(ScorerModel.by_hand(["railway", "water"]).to_text())
+    record = json.loads(ScorerModel.by_hand(["railway", "water"]).to_text())
     for name, value in changes.items():
-        said["classes"]["water"][name] = value
-    return json.dumps(said)
+        record["classes"]["water"][name] = value
+    return json.dumps(record)
 
 
 def drawn(**changes):
-    said = json.loads(ScorerModel.by_hand(["water"]).to_text())
-    said["graph"].update(changes)
-    return json.dumps(said)
+    record = json.loads(ScorerModel.by_hand(["water"]).to_text())
+    record["graph"].update(changes)
+    return json.dumps(record)
 
 
 def test_text_keeps_six_digits_and_comes_back_with_the_rules_of_the_graph():
@@ -32,15 +32,15 @@ def test_text_keeps_six_digits_and_comes_back_with_the_rules_of_the_graph():
     assert again == first
     assert first.scaling.tolist() == [0.01, 0.00123456789]
     assert again.rates[1].vanish_per_year == pytest.approx(1 / 3, rel=1e-5)
-    said = ScorerModel.from_text(drawn(gate_m=7.5, degrees=[0.1, -0.2, -0.3]))
-    assert (said.rules.gate_m, said.rules.degrees) == (7.5, (0.1, -0.2, -0.3))
-    assert ScorerModel.from_text(said.to_text()).rules == said.rules
-    assert said.of_classes(["railway"]).rules == said.rules
+    given = ScorerModel.from_text(drawn(gate_m=7.5, degrees=[0.1, -0.2, -0.3]))
+    assert (given.rules.gate_m, given.rules.degrees) == (7.5, (0.1, -0.2, -0.3))
+    assert ScorerModel.from_text(given.to_text()).rules == given.rules
+    assert given.of_classes(["railway"]).rules == given.rules
 
 
 def test_classes_are_put_in_the_order_of_a_map_and_unknown_ones_are_by_hand():
-    said = ScorerModel.from_text(learnt(temper=0.5))
-    mine = said.of_classes(["building", "water"])
+    given = ScorerModel.from_text(learnt(temper=0.5))
+    mine = given.of_classes(["building", "water"])
     assert mine.classes == ("building", "water")
     assert mine.scaling.tolist() == [0.01, 0.5]
     assert mine.rates[0] == hand_rates("building")

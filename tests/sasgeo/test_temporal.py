@@ -67,9 +67,9 @@ def test_a_carried_drone_is_found_again_by_another_belief_alone(region):
 
 def test_without_odometry_what_the_odometer_says_changes_nothing(region):
     poses = way_of(START, 3, STEP_M)
-    told = flown(SasgeoTrackAlone(), region, views_of(region, poses))
+    given = flown(SasgeoTrackAlone(), region, views_of(region, poses))
     misled = flown(SasgeoTrackAlone(), region, views_of(region, poses, said={2: (500.0, 0.0, 90.0)}))
-    assert [fix.pose for fix in told] == [fix.pose for fix in misled]
+    assert [fix.pose for fix in given] == [fix.pose for fix in misled]
 
 
 def test_the_scale_of_a_flight_is_learned_and_a_prior_of_it_kept_where_nothing_was_seen(region):

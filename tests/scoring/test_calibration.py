@@ -49,9 +49,9 @@ def test_the_brier_score_is_that_of_scikit_learn() -> None:
 
 def test_with_distinct_confidences_bins_are_those_of_scikit_learn() -> None:
     confidence, right = some(200, 3)
-    reached, said = calibration_curve(right, confidence, n_bins=10, strategy="quantile")
+    reached, result = calibration_curve(right, confidence, n_bins=10, strategy="quantile")
     assert len(reached) == 10  # of 20 each
-    assert calibration_error(simple(confidence, right), bins=10) == pytest.approx(np.abs(reached - said).mean())
+    assert calibration_error(simple(confidence, right), bins=10) == pytest.approx(np.abs(reached - result).mean())
 
 
 @given(rows=ROWS)

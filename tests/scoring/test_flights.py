@@ -247,8 +247,8 @@ def test_the_odometer_says_the_rest_between_fixes():
 
 def drift_of(increments, **more):
     heads, truths = a_flight(**more)
-    told = [replace(head, increment=one) for head, one in zip(heads, increments, strict=True)]
-    return score_flights(told, truths, {}).flights["odometer_drift"].item()
+    lines = [replace(head, increment=one) for head, one in zip(heads, increments, strict=True)]
+    return score_flights(lines, truths, {}).flights["odometer_drift"].item()
 
 
 def test_drift_is_what_the_odometer_alone_errs_after_half_a_kilometre():

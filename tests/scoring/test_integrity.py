@@ -47,8 +47,8 @@ def split_of(kind):
         else [{"half": half} for half in "aabb"]
     )
     places = [{"name": name, "regions": [name]} | part for name, part in zip(names, parts, strict=True)]
-    said = {"id": "two", "title": "Two", "kind": kind, "buffer_m": 0.0, "place": places}
-    return make_split(SplitFile.model_validate(said), grids)
+    values = {"id": "two", "title": "Two", "kind": kind, "buffer_m": 0.0, "place": places}
+    return make_split(SplitFile.model_validate(values), grids)
 
 
 def test_the_own_word_of_a_matcher_needs_no_split():
@@ -195,10 +195,10 @@ def test_without_an_answer_a_query_is_false_at_full_coverage_and_no_part_of_cali
 
 def test_an_order_that_is_no_probability_has_no_figures_that_judge_one():
     judged = own_confidence(scores(ERRORS, confidence=np.where(ERRORS < 25, 0.75, 0.25)))
-    told, bare = (
+    given, bare = (
         {row.metric for row in integrity_rows("mine", "margin", judged, is_calibrated=is_calibrated)}
         for is_calibrated in (True, False)
     )
     costs = {f"cost_{ratio:g}{kind}" for ratio in COST_RATIOS for kind in ("", "_place")}
-    assert told - bare == {"brier", "ece", *costs}
+    assert given - bare == {"brier", "ece", *costs}
     assert {"aurc", "e_aurc", "augrc"} < bare

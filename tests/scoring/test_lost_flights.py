@@ -68,5 +68,5 @@ def test_what_holds_no_such_flights_is_told_in_one_line_before_anything_is_print
     folder = Path(__file__).parents[2] / board
     with pytest.raises(SystemExit):
         PROGRAM["main"]([str(folder), "--suite", suite])
-    said = capsys.readouterr()
-    assert (said.out, fault in said.err) == ("", True)
+    out = capsys.readouterr()
+    assert (out.out, fault in out.err) == ("", True)

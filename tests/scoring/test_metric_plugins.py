@@ -26,8 +26,8 @@ def near(rows):
 
 
 def metric(values=near, **changes):
-    said = {"name": "near", "meaning": "Nearness of the fix", "better": "higher", "tracks": ("localization",)}
-    return sgb.MeanMetric(**(said | {"values": values} | changes))
+    record = {"name": "near", "meaning": "Nearness of the fix", "better": "higher", "tracks": ("localization",)}
+    return sgb.MeanMetric(**(record | {"values": values} | changes))
 
 
 def foreign(*metrics):

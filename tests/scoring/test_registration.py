@@ -23,14 +23,14 @@ def design(count=100, **columns):
 
 def test_a_least_difference_beyond_what_a_perfect_order_gains_is_refused():
     # 78 % of the answers are false, so a perfect order has 0.447 of the margin's 0.496, and a fifth of that is 0.099.
-    told = []
+    lines = []
     pilots = {"rejection": Pilot(second=0.496, false_share=0.78)}
     refused = r"'rejection' cannot be reached: at most 0\.049 .* and 0\.099 is to matter"
-    with reporting(told.append), pytest.raises(ConfigError, match=refused):
+    with reporting(lines.append), pytest.raises(ConfigError, match=refused):
         check_contrasts([ABSENT], pilots, design())
-    assert len(told) == 1
+    assert len(lines) == 1
     excess = replace(ABSENT, metric="e_aurc")
-    with reporting(told.append):
+    with reporting(lines.append):
         (found,) = check_contrasts([excess], {"rejection": Pilot(second=0.05)}, design())
     assert (found.best, found.attainable, found.least) == (0.0, 0.05, pytest.approx(0.01))
 
@@ -58,15 +58,15 @@ def test_power_is_told_for_both_ends_of_the_order_of_holm():
         names = [f"p{at}" for at in range(count)]
         return design(count, place=names, block=names)
 
-    told = []
+    lines = []
     others = [replace(GRAPH, name=f"other-{at}") for at in range(12)]
     pilot = Pilot(discordant=0.25, correlation=0.0)
-    with reporting(told.append):
+    with reporting(lines.append):
         found = check_contrasts([GRAPH, *others], {"graph": pilot}, apart(80))[0]
     assert found.detectable == pytest.approx(detectable_difference(80, 0.25))
     assert found.detectable < found.detectable_first < np.inf
     both = f"can show is {found.detectable:.3f}, or {found.detectable_first:.3f} if it comes first in Holm's order"
-    assert told[0].endswith(both)
+    assert lines[0].endswith(both)
     # 30 places have 7.5 discordant ones, and 2 / 2^7.5 exceeds 0.05 / 13: the test cannot show anything.
     few = registered(GRAPH, pilot, apart(30), contrasts=13).to_text()
     assert few.endswith("or none if it comes first in Holm's order")

@@ -44,11 +44,11 @@ TRUTH = Truth(
 )
 
 
-def answer(*places, scores=None, **said):
+def answer(*places, scores=None, **changes):
     """Poses (east, north, yaw) with scores falling by one, unless given."""
     poses = [Pose(easting_m=east, northing_m=north, yaw_deg=yaw) for east, north, yaw in places]
     scores = scores or [-float(at) for at in range(len(poses))]
-    return Prediction(query_id="a", candidates=tuple(zip(poses, scores, strict=True)), **said)
+    return Prediction(query_id="a", candidates=tuple(zip(poses, scores, strict=True)), **changes)
 
 
 def row_of(prediction, *, head=HEAD, truth=TRUTH, **changes):

@@ -28,8 +28,8 @@ def counts_of(places, *, classes=CLASSES, right=0.9):
         seen = np.where(rng.random(labels.shape) < right, labels, 1 - labels)
         image = replace(with_picture(np.zeros((SIDE, SIDE, 3), dtype=np.uint8)), season="summer")
         labelled = LabelledImage(image=image, classes=classes, labels=labels, place=place)
-        said = Segmentation(classes=classes, probability_bytes=(seen * 200 + 20).astype(np.uint8))
-        found.append(PixelCounts.of(labelled, said, image=str(at)))
+        given = Segmentation(classes=classes, probability_bytes=(seen * 200 + 20).astype(np.uint8))
+        found.append(PixelCounts.of(labelled, given, image=str(at)))
     return found
 
 

@@ -224,8 +224,8 @@ def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():
         mine, before = (pick(table, name, "success_25m") for table in (board, alone))
         assert ranks(mine) == ranks(before)
         assert mine["detectable"] == before["detectable"]
-    said = {name: EntryLabel("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
-    first, apart = rows_of(Contents(leaderboard=with_entry_labels(board, said)), MARKDOWN)
+    values = {name: EntryLabel("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
+    first, apart = rows_of(Contents(leaderboard=with_entry_labels(board, values)), MARKDOWN)
     assert set(column_of(first, "matcher")) == {"good (as submitted)", "bad (as submitted)"}
     assert column_of(apart, "matcher") == ["best (as submitted) (set apart)"]
     assert apart.notes == ("best: for a reason.",)
@@ -328,9 +328,9 @@ def test_the_texts_say_the_figures_and_what_is_missing():
 
 
 def test_the_head_of_a_suite_counts_the_queries_of_its_figures_whoever_does_not_answer_them():
-    said = {"role": ["stress", "control"] * 4}
-    able = scores([1.0, 99.0] * 4, **said)
-    board = leaderboard({"able": able, "not": scores([math.inf] * 8, status="not applicable", **said)}, draws=200)
+    values = {"role": ["stress", "control"] * 4}
+    able = scores([1.0, 99.0] * 4, **values)
+    board = leaderboard({"able": able, "not": scores([math.inf] * 8, status="not applicable", **values)}, draws=200)
     (short,) = summary(Book.of(board))
     assert short.rows[0].cells[1].text == "4"
     (alone,) = summary(Book.of(board[board["matcher"] == "not"]))

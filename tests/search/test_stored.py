@@ -146,10 +146,10 @@ def test_what_is_cut_off_leaves_the_levels_as_they_were(tmp_path, whole):
 def test_levels_whose_bytes_are_damaged_are_told_in_one_line(tmp_path, stored, name, spoil, words):
     path = shutil.copytree(stored.folder, tmp_path / "map") / name
     path.write_bytes(spoil(path.read_bytes())) if spoil else path.unlink()
-    with pytest.raises(StoreError, match=words) as told:
+    with pytest.raises(StoreError, match=words) as caught:
         StoredField.open(tmp_path / "map")
-    assert "store the levels of the map again" in str(told.value)
-    assert len(str(told.value).splitlines()) == 1
+    assert "store the levels of the map again" in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
 
 
 def test_a_pipe_in_place_of_a_level_is_refused_not_waited_for(tmp_path, stored):

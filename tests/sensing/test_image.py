@@ -133,12 +133,12 @@ def test_bytes_that_were_changed_or_cut_are_a_picture_or_one_line(data, changes,
     broken = bytearray(data[:kept])
     for at, value in changes:
         broken[at % len(broken)] = value
-    told = ""
+    message = ""
     try:
         assert decode_image(bytes(broken)).ndim == 3
     except ImageError as error:
-        told = str(error)
-    assert "\n" not in told
+        message = str(error)
+    assert "\n" not in message
 
 
 def test_bytes_and_pixels_are_counted_before_decoding(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -333,12 +333,15 @@ def test_exiftool_reads_the_same(kind, tmp_path):
     path = write(tmp_path / "a", packet_of(part_of(DJI, facts, prefix="drone-dji")), kind=kind, make="DJI", inner=inner)
     command = [str(shutil.which("exiftool")), "-n", "-j", str(path)]
     run = subprocess.run(command, capture_output=True, check=True)  # noqa: S603 - ours
-    (told,) = json.loads(run.stdout)
+    (tags,) = json.loads(run.stdout)
     photo = read_photo(Path(path))
-    assert (photo.lon_deg, photo.lat_deg) == (pytest.approx(told["GPSLongitude"]), pytest.approx(told["GPSLatitude"]))
-    assert (photo.height_m, photo.altitude_m) == (told["RelativeAltitude"], float(told["AbsoluteAltitude"]))
-    assert (photo.gimbal.yaw_deg, photo.gimbal.pitch_deg) == (told["GimbalYawDegree"], told["GimbalPitchDegree"])
-    assert (photo.width_px, photo.height_px) == (told["ImageWidth"], told["ImageHeight"])
+    assert (photo.lon_deg, photo.lat_deg) == (
+        pytest.approx(tags["GPSLongitude"]),
+        pytest.approx(tags["GPSLatitude"]),
+    )
+    assert (photo.height_m, photo.altitude_m) == (tags["RelativeAltitude"], float(tags["AbsoluteAltitude"]))
+    assert (photo.gimbal.yaw_deg, photo.gimbal.pitch_deg) == (tags["GimbalYawDegree"], tags["GimbalPitchDegree"])
+    assert (photo.width_px, photo.height_px) == (tags["ImageWidth"], tags["ImageHeight"])
     lens = photo.lens
-    assert (lens.calibrated_px, lens.zoom) == (told["CalibratedFocalLength"], told["DigitalZoomRatio"])
-    assert (lens.focal_mm, lens.film_mm) == (told["FocalLength"], told["FocalLengthIn35mmFormat"])
+    assert (lens.calibrated_px, lens.zoom) == (tags["CalibratedFocalLength"], tags["DigitalZoomRatio"])
+    assert (lens.focal_mm, lens.film_mm) == (tags["FocalLength"], tags["FocalLengthIn35mmFormat"])

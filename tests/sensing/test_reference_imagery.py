@@ -110,11 +110,11 @@ def test_buildings_are_seen_where_the_map_has_them(rendered):
 
 def test_a_second_time_nothing_is_rendered(rendered):
     path = rendered[0] / "regions" / TOWN / "ortho.tif"
-    before, told = path.stat().st_mtime_ns, []
-    with reporting(told.append):
+    before, given = path.stat().st_mtime_ns, []
+    with reporting(given.append):
         assert render(rendered[0]) == path
     assert path.stat().st_mtime_ns == before
-    assert told == [f"{TOWN}: rendered imagery is up to date, nothing to do"]
+    assert given == [f"{TOWN}: rendered imagery is up to date, nothing to do"]
 
 
 @pytest.mark.parametrize("changes", [{"seed": 1}, {"season": "snow"}, {"family": "shifted"}])
@@ -227,27 +227,27 @@ def test_a_rendering_that_ends_early_leaves_the_region_as_it_was(rendered, tmp_p
         raise fault
 
     monkeypatch.setattr(*place, fail)
-    with pytest.raises((StoreError, ImageryError, KeyboardInterrupt)) as told:
+    with pytest.raises((StoreError, ImageryError, KeyboardInterrupt)) as caught:
         render(tmp_path / "out", replace(COARSE, seed=9))
-    assert "\n" not in str(told.value)
-    assert fault is not FULL or "ortho.tif cannot be written (No space left on device)" in str(told.value)
+    assert "\n" not in str(caught.value)
+    assert fault is not FULL or "ortho.tif cannot be written (No space left on device)" in str(caught.value)
     assert state_of(folder) == before
 
 
 @pytest.mark.slow
 def test_the_command_prints_the_image_and_refuses_in_one_line(program, lay_towns, tmp_path):
     lay_towns(tmp_path / "out", TOWN)
-    code, told, _ = program("render-imagery", TOWN, "--gsd-m", 2, "--season", "winter")
-    assert (code, told) == (0, f"out/regions/{TOWN}/ortho.tif\n")
-    code, told, said = program("render-imagery", TOWN, "--season", "monsoon")
-    assert (code, told) == (2, "")
-    assert said == "sasgeo-bench: season is one of spring, summer, autumn, winter, snow, got 'monsoon'\n"
+    code, out, _ = program("render-imagery", TOWN, "--gsd-m", 2, "--season", "winter")
+    assert (code, out) == (0, f"out/regions/{TOWN}/ortho.tif\n")
+    code, out, err = program("render-imagery", TOWN, "--season", "monsoon")
+    assert (code, out) == (2, "")
+    assert err == "sasgeo-bench: season is one of spring, summer, autumn, winter, snow, got 'monsoon'\n"
     assert "rendered from" in program("inspect", TOWN)[1].replace("\n", " ")
 
 
 def test_views_of_real_imagery_are_not_cut_out_of_a_rendered_one(program, lay_towns, tmp_path):
     lay_towns(tmp_path / "out", TOWN)
     program("render-imagery", TOWN, "--gsd-m", 2)
-    code, _, said = program("make-queries", "--suite", "real-image", "--regions", TOWN, "--n", 1)
+    code, _, err = program("make-queries", "--suite", "real-image", "--regions", TOWN, "--n", 1)
     assert code == 2
-    assert "no real imagery" in said
+    assert "no real imagery" in err

@@ -64,8 +64,8 @@ def village(relief: float = 1.0) -> Scene:
 
 
 def camera(**more) -> Camera:
-    said = {"east_m": EAST, "north_m": NORTH, "height_m": 80.0, "yaw_deg": 0.0}
-    return Camera.pointed(intrinsics=LENS, **said | more)
+    values = {"east_m": EAST, "north_m": NORTH, "height_m": 80.0, "yaw_deg": 0.0}
+    return Camera.pointed(intrinsics=LENS, **values | more)
 
 
 def drawn(points_px) -> np.ndarray:

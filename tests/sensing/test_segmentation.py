@@ -40,13 +40,13 @@ def test_a_segmentation_written_to_bytes_is_read_again(planes: np.ndarray) -> No
 
 @given(arrays(np.uint8, (1, 8, 8)), st.floats(0, 1))
 def test_new_shares_are_met_keep_the_order_and_leave_silence_alone(planes: np.ndarray, share: float) -> None:
-    said = planes != SILENT
+    result = planes != SILENT
     moved = seen(planes).with_shares({"c0": share})
-    np.testing.assert_array_equal(moved.probability_bytes == SILENT, ~said)
-    if said.any():
+    np.testing.assert_array_equal(moved.probability_bytes == SILENT, ~result)
+    if result.any():
         assert moved.shares()["c0"] == pytest.approx(share, abs=1 / 508 + 1e-9)
-    order = np.argsort(planes[said], kind="stable")
-    assert (np.diff(moved.probability_bytes[said][order].astype(int)) >= 0).all()
+    order = np.argsort(planes[result], kind="stable")
+    assert (np.diff(moved.probability_bytes[result][order].astype(int)) >= 0).all()
 
 
 def test_odds_change_by_one_factor_and_classes_without_a_new_share_stay() -> None:

@@ -120,10 +120,10 @@ def test_tables_of_before_there_were_flights_are_read_and_ask_what_they_asked(tm
     ],
 )
 def test_a_step_that_is_not_whole_is_refused_with_what_was_given(changes):
-    with pytest.raises(PoseError, match="a step has a frame from 0 on and, after the first, 3 finite numbers") as told:
+    with pytest.raises(PoseError, match="a step has a frame from 0 on and, after the first, 3 finite numbers") as error:
         Step(**{"sequence_id": "f1", "frame": 1} | changes)
-    assert "sequence_id='f1'" in str(told.value)
-    assert "\n" not in str(told.value)
+    assert "sequence_id='f1'" in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

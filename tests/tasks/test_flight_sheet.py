@@ -119,9 +119,9 @@ def test_inspect_draws_flights_one_flight_or_the_sheet_of_one_view(made, program
     assert len(flight_id(view)) == SEQUENCE_DIGITS
     sheets = {}
     for query in (None, flight_id(view), view):
-        code, told, err = program("inspect", NAME, "--out", out, *(("--query", query) if query else ()))
+        code, printed, err = program("inspect", NAME, "--out", out, *(("--query", query) if query else ()))
         assert (code, err) == (0, "")
-        path = Path(told.splitlines()[-1].removeprefix("contact sheet: "))
+        path = Path(printed.splitlines()[-1].removeprefix("contact sheet: "))
         sheets[query] = cv2.imread(str(path)).shape[:2]
     assert sheets[None][1] > sheets[flight_id(view)][1]
     assert sheets[view] != sheets[flight_id(view)]

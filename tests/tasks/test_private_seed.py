@@ -107,23 +107,23 @@ def test_a_seed_of_the_environment_is_taken_out_of_it(tmp_path):
 def test_make_queries_draws_by_a_private_seed_into_a_root_of_its_own(program, tmp_path):
     asked = ("make-queries", "--suite", "clean", "--suite", "occlusion", "--regions", "town-riverside", "--n", 1)
     seed_file = put_seed(tmp_path)
-    code, told, err = program(*asked)
+    code, out, err = program(*asked)
     assert code == 0, err
-    code, told, err = program(*asked, "--seed-file", seed_file)
+    code, out, err = program(*asked, "--seed-file", seed_file)
     assert code == 0, err
     assert err.startswith(f"drawing by a private seed of 128 bits, commitment {SEED.commitment[:12]}, into OUT/private")
     assert "warning" not in err
-    assert TEXT not in told + err
+    assert TEXT not in out + err
     public, private = (tmp_path / "out" / name for name in ("tasks", "private/tasks"))
     folders = [path.parent.relative_to(public) for path in sorted(public.rglob("task.json"))]
     assert folders == [path.parent.relative_to(private) for path in sorted(private.rglob("task.json"))]
     for folder in folders:
         assert set(task_files.Task.open(public / folder).ids()).isdisjoint(task_files.Task.open(private / folder).ids())
-        said, other = (task_files.read_task(root / folder) for root in (private, public))
-        assert said["private_seed"] == {"commitment": SEED.commitment, "bits": 128}
+        given, other = (task_files.read_task(root / folder) for root in (private, public))
+        assert given["private_seed"] == {"commitment": SEED.commitment, "bits": 128}
         assert "private_seed" not in other
-        assert said["counts"]["localization"] == other["counts"]["localization"]
-        assert said["map_fingerprint"] == other["map_fingerprint"]
+        assert given["counts"]["localization"] == other["counts"]["localization"]
+        assert given["map_fingerprint"] == other["map_fingerprint"]
     assert files_with(tmp_path / "out", TEXT) == []
 
 
@@ -131,12 +131,12 @@ def test_a_weak_private_seed_is_warned_of(program, monkeypatch):
     asked = ("make-queries", "--suite", "clean", "--regions", "town-riverside", "--n", 1, "--dry-run")
     for text, words in (("12345", "16 bits are no secret"), ("f" * 20, "makes no row reproduced: that takes 128 bits")):
         monkeypatch.setenv("SASGEO_SEED", text)
-        code, told, err = program(*asked)
+        code, out, err = program(*asked)
         assert code == 0, err
         assert words in err
-        assert text not in told + err
+        assert text not in out + err
         assert "SASGEO_SEED" not in os.environ
-        assert "out/private/tasks" in told
+        assert "out/private/tasks" in out
 
 
 def test_a_public_and_a_private_seed_at_once_are_refused(mistake, monkeypatch):

@@ -184,15 +184,15 @@ def test_how_much_of_a_disc_is_on_the_map_does_not_tell_whether_the_truth_is_in_
     beyond_m = {
         name: [max(west - x, x - east, south - y, y - north) for x, y in found] for name, found in centers.items()
     }
-    told = {
+    record = {
         (measure, name): auc(values[name], values["inside"])
         for measure, values in (("share", shares), ("beyond", beyond_m))
         for name in ("outside", "anywhere outside")
     }
-    assert told["share", "outside"] == pytest.approx(0.5, abs=0.07), told
-    assert told["beyond", "outside"] == pytest.approx(0.5, abs=0.13), told
-    assert told["share", "anywhere outside"] < 0.3, told
-    assert told["beyond", "anywhere outside"] > 0.7, told
+    assert record["share", "outside"] == pytest.approx(0.5, abs=0.07), record
+    assert record["beyond", "outside"] == pytest.approx(0.5, abs=0.13), record
+    assert record["share", "anywhere outside"] < 0.3, record
+    assert record["beyond", "anywhere outside"] > 0.7, record
 
 
 # --- candidates -----------------------------------------------------------------------------------------------------

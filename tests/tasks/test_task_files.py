@@ -266,20 +266,20 @@ def test_what_is_asked_has_one_hash_for_good_and_another_for_whatever_decides_an
         "prior_radius_m": 500.0,
         "frame": None,
     }
-    said = {"map_fingerprint": "ff"}
+    values = {"map_fingerprint": "ff"}
     # If this changes, all answers there are have to be given anew.
-    assert asked_sha256(row, said)[:16] == "8e5fa691a0d01c92"
+    assert asked_sha256(row, values)[:16] == "8e5fa691a0d01c92"
     others = [row | {name: row[name] * 2} for name in ("query_id", "evidence", "prior_radius_m")]
     others += [row | {"observed_on": dt.date(2026, 1, 3)}, row | {"season": "snow"}]
-    found = {asked_sha256(row, said), asked_sha256(row, {"map_fingerprint": "ee"}), asked_sha256(row, {})}
-    assert len(found | {asked_sha256(other, said) for other in others}) == len(others) + 3
+    found = {asked_sha256(row, values), asked_sha256(row, {"map_fingerprint": "ee"}), asked_sha256(row, {})}
+    assert len(found | {asked_sha256(other, values) for other in others}) == len(others) + 3
 
 
 def test_every_file_says_whose_data_it_holds_and_under_which_licence(written):
     for path in (written[0] / QUERIES, written[1] / TRUTH):
-        said = pq.read_schema(path).metadata
-        assert said[b"attribution"].decode() == ATTRIBUTION
-        assert said[b"licence"].decode() == LICENCE
+        record = pq.read_schema(path).metadata
+        assert record[b"attribution"].decode() == ATTRIBUTION
+        assert record[b"licence"].decode() == LICENCE
     about = json.loads((written[0] / TASK).read_text(encoding="utf-8"))
     assert (about["attribution"], about["licence"]) == (ATTRIBUTION, LICENCE)
 
@@ -319,16 +319,16 @@ def test_a_missing_truth_a_foreign_file_and_a_wrong_count_are_faults(written):
     (task_folder / "deep" / "note.txt").write_text("?")
     about = json.loads((task_folder / TASK).read_text(encoding="utf-8"))
     (task_folder / TASK).write_text(json.dumps(about | {"counts": {"retrieval": 4}}))
-    told = "\n".join(opened(written).faults())
-    assert "truth.parquet: 2 truths that are not those of the 3 queries" in told
-    assert "note.txt: not part of a task" in told
-    assert "holds 3 of retrieval, task.json says 4 of retrieval: make the queries again" in told
+    message = "\n".join(opened(written).faults())
+    assert "truth.parquet: 2 truths that are not those of the 3 queries" in message
+    assert "note.txt: not part of a task" in message
+    assert "holds 3 of retrieval, task.json says 4 of retrieval: make the queries again" in message
 
 
 def test_truths_say_which_queries_they_are_of_and_what_is_hidden_stays_with_them(folders):
     write_task(*folders, [(one_query(), one_truth())], ABOUT, TruthManifest(seed=987_654_321))
-    said = json.loads((folders[1] / TRUTH_OF).read_text(encoding="utf-8"))
-    assert said == {"queries_sha256": read_task(folders[0])["files"][QUERIES]["sha256"], "seed": 987_654_321}
+    record = json.loads((folders[1] / TRUTH_OF).read_text(encoding="utf-8"))
+    assert record == {"queries_sha256": read_task(folders[0])["files"][QUERIES]["sha256"], "seed": 987_654_321}
     assert "987654321" not in (folders[0] / TASK).read_text(encoding="utf-8")
     assert sorted(path.name for path in folders[0].iterdir()) == [QUERIES, TASK]
     assert sorted(path.name for path in folders[1].iterdir()) == [TRUTH_OF, TRUTH]
@@ -367,7 +367,7 @@ def test_a_task_without_its_queries_has_that_one_fault(written):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         ("{", "is damaged"),
         ("[]", "is damaged"),
@@ -382,19 +382,19 @@ def test_a_task_without_its_queries_has_that_one_fault(written):
         ('{"schema_version": "1"}', "has schema version '1'"),
     ],
 )
-def test_a_damaged_or_foreign_task_json_is_named_with_its_mend(text, told, written):
+def test_a_damaged_or_foreign_task_json_is_named_with_its_mend(text, expected, written):
     (written[0] / TASK).write_text(text)
     with pytest.raises(StoreError) as caught:
         read_task(written[0])
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
     assert str(caught.value).endswith("make the queries again")
     assert "\n" not in str(caught.value)
 
 
 def test_tasks_and_stored_boards_of_earlier_versions_stay_what_they_were(written):
-    told = json.loads((written[0] / TASK).read_text())
+    record = json.loads((written[0] / TASK).read_text())
     for version in TASK_VERSIONS:
-        (written[0] / TASK).write_text(json.dumps(told | {"task_version": version}))
+        (written[0] / TASK).write_text(json.dumps(record | {"task_version": version}))
         assert read_task(written[0])["task_version"] == version
     boards = [json.loads(path.read_text()) for path in (ROOT / "docs" / "results").glob("*/board.json")]
     assert boards

@@ -68,13 +68,13 @@ def test_there_is_one_request_for_each_region_and_suite_whatever_is_named_twice(
 
 
 def test_without_regions_all_that_can_be_built_are_taken_and_the_others_told(tmp_path):
-    told = []
-    with reporting(told.append):
+    lines = []
+    with reporting(lines.append):
         found = plan(tmp_path, regions=())
     assert {item.region.id for item in found} == {name for name in list_region_files() if name.startswith("town-")}
-    assert len(told) == 1
-    assert "vaduz" in told[0]
-    assert "have no extract on this machine" in told[0]
+    assert len(lines) == 1
+    assert "vaduz" in lines[0]
+    assert "have no extract on this machine" in lines[0]
 
 
 @pytest.mark.real
@@ -97,7 +97,7 @@ def test_a_region_file_of_ones_own_goes_with_a_split_of_ones_own(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "expected"),
     [
         (
             {"suites": ("claen",)},
@@ -111,10 +111,10 @@ def test_a_region_file_of_ones_own_goes_with_a_split_of_ones_own(tmp_path):
         ({"count": -3}, "--n must be at least 1, got -3"),
     ],
 )
-def test_what_cannot_be_is_refused_with_a_hint(changes, told, tmp_path):
+def test_what_cannot_be_is_refused_with_a_hint(changes, expected, tmp_path):
     with pytest.raises(ConfigError) as caught:
         plan(tmp_path, **changes)
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 

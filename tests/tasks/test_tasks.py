@@ -142,8 +142,8 @@ def test_ids_are_unique_and_sorted_and_say_nothing(tasks):
 
 def test_task_json_says_where_a_task_comes_from(tasks):
     about = read_task(tasks / "tasks/clean" / RIVERSIDE)
-    said = [about[name] for name in ("suite", "region", "split", "sites", "map_date")]
-    assert said == ["clean", RIVERSIDE, "crossfit", 2, "2025-01-01"]
+    lines = [about[name] for name in ("suite", "region", "split", "sites", "map_date")]
+    assert lines == ["clean", RIVERSIDE, "crossfit", 2, "2025-01-01"]
     queries = list(read_queries(tasks / "tasks/clean" / RIVERSIDE))
     assert about["prior_groups"] == sorted({query.prior_group for query in queries})
     assert sum(about["counts"].values()) == len(queries)
@@ -173,14 +173,14 @@ def leaves(column: pa.ChunkedArray) -> Iterator[pa.Array]:
 
 def spelled(pose) -> tuple[set[bytes], set[float]]:
     """A truth as bytes and texts long enough not to come up by chance, and as numbers."""
-    said, numbers = set(), set()
+    given, numbers = set(), set()
     for value, fewest in ((pose.easting_m, 1), (pose.northing_m, 1), (pose.yaw_deg, 2)):
-        said.add(struct.pack("<d", value))
-        said.add(struct.pack("<f", value))
+        given.add(struct.pack("<d", value))
+        given.add(struct.pack("<f", value))
         for decimals in range(fewest, 7):
             numbers.add(round(value, decimals))
-            said.add(f"{value:.{decimals}f}".encode())
-    return {item for item in said if len(item) >= 4}, numbers
+            given.add(f"{value:.{decimals}f}".encode())
+    return {item for item in given if len(item) >= 4}, numbers
 
 
 def test_no_truth_is_spelled_out_in_a_task(tasks):
@@ -205,19 +205,19 @@ def test_no_truth_is_spelled_out_in_a_task(tasks):
         ]
         text = b"\n".join([raw, *buffers])
         for pose in {truth.pose for truth in read_truths(truth_of(folder)) if truth.pose}:
-            said, exact = spelled(pose)
+            given, exact = spelled(pose)
             assert not exact & numbers
-            assert not [item for item in said if item in text]
-            looked += len(said)
+            assert not [item for item in given if item in text]
+            looked += len(given)
     assert looked > 50
 
 
 def test_the_search_for_spelled_truths_finds_one_that_is_there(tasks):
     folder = task_folders(tasks)[0]
     pose = next(truth.pose for truth in read_truths(truth_of(folder)) if truth.pose)
-    said, numbers = spelled(pose)
-    assert struct.pack("<d", pose.easting_m) in said
-    assert f"{pose.northing_m:.3f}".encode() in said
+    given, numbers = spelled(pose)
+    assert struct.pack("<d", pose.easting_m) in given
+    assert f"{pose.northing_m:.3f}".encode() in given
     assert round(pose.easting_m, 1) in numbers
 
 
@@ -229,12 +229,12 @@ def test_the_seed_lies_with_the_truths_and_nowhere_that_a_matcher_sees(own_out):
     map_folder = own_out / "regions" / made.folder.name
     assert map_folder.name != "town-grid"
     assert json.loads((truth_of(made.folder) / TRUTH_OF).read_text(encoding="utf-8"))["seed"] == SEED
-    said = {str(SEED).encode(), f"{SEED:x}".encode(), struct.pack("<q", SEED), struct.pack(">q", SEED)}
+    values = {str(SEED).encode(), f"{SEED:x}".encode(), struct.pack("<q", SEED), struct.pack(">q", SEED)}
     looked = set()
     for folder in (own_out / "tasks", own_out / "regions"):
         for path in folder.rglob("*"):
             if path.is_file():
-                assert not [item for item in said if item in path.read_bytes() + str(path).encode()], path
+                assert not [item for item in values if item in path.read_bytes() + str(path).encode()], path
                 looked.add(path.name)
     assert {QUERIES, TASK, "region.json"} <= looked
     tables = [path for folder in (made.folder, map_folder) for path in folder.glob("*.parquet")]
@@ -327,11 +327,11 @@ def leftovers(out: Path) -> list[str]:
 
 
 def test_a_second_run_waits_for_the_first_and_both_leave_a_whole_task(own_out, tasks):
-    told: list[str] = []
+    lines: list[str] = []
     waiting = threading.Event()
 
     def tell(line):
-        told.append(line)
+        lines.append(line)
         if "is being written by another run" in line:
             waiting.set()
 
@@ -349,11 +349,11 @@ def test_a_second_run_waits_for_the_first_and_both_leave_a_whole_task(own_out, t
 
 @pytest.mark.slow
 def test_two_runs_of_different_counts_at_once_leave_the_map_of_the_last_and_its_task(own_out, tasks):
-    told: dict[int, list[str]] = {2: [], 1: []}
+    values: dict[int, list[str]] = {2: [], 1: []}
     begun, waiting = threading.Event(), threading.Event()
 
     def tell(line):
-        told[int(threading.current_thread().name)].append(line)
+        values[int(threading.current_thread().name)].append(line)
         if "is being written by another run" in line:
             waiting.set()
         else:
@@ -363,7 +363,7 @@ def test_two_runs_of_different_counts_at_once_leave_the_map_of_the_last_and_its_
     def draw(count):
         make(own_out, "topology-twins", regions=("town-grid",), count=count, may_be_fewer=count > 1)
 
-    first, last = (threading.Thread(target=draw, args=(count,), name=str(count)) for count in told)
+    first, last = (threading.Thread(target=draw, args=(count,), name=str(count)) for count in values)
     with reporting(tell):
         first.start()
         begun.wait()
@@ -371,8 +371,8 @@ def test_two_runs_of_different_counts_at_once_leave_the_map_of_the_last_and_its_
         for run in (first, last):
             run.join()
     folder = own_out / "tasks/topology-twins/town-grid+topology-twins"
-    assert [sum(" queries at " in line for line in lines) for lines in told.values()] == [1, 1]
-    assert [sum("is being written by another run" in line for line in lines) for lines in told.values()] == [0, 1]
+    assert [sum(" queries at " in line for line in lines) for lines in values.values()] == [1, 1]
+    assert [sum("is being written by another run" in line for line in lines) for lines in values.values()] == [0, 1]
     assert check_task(Task.open(folder)) == []
     assert leftovers(own_out) == []
     assert read_task(folder)["sites"] == len({truth.pose for truth in read_truths(truth_of(folder))}) == 1
@@ -459,8 +459,8 @@ def test_the_truths_of_another_task_are_not_shown(copied):
 def test_a_task_on_a_map_that_was_built_anew_is_not_shown(copied):
     folder = copied / "tasks/clean" / RIVERSIDE
     manifest = copied / "regions" / RIVERSIDE / "region.json"
-    said = json.loads(manifest.read_text(encoding="utf-8"))
-    manifest.write_text(json.dumps(said | {"fingerprint": "0"}), encoding="utf-8")
+    record = json.loads(manifest.read_text(encoding="utf-8"))
+    manifest.write_text(json.dumps(record | {"fingerprint": "0"}), encoding="utf-8")
     with pytest.raises(StoreError, match="was built anew since: make the queries again"):
         panels_of(Task.open(folder))
 
@@ -500,7 +500,7 @@ def test_dates_and_edits_of_a_map_are_of_its_region_and_no_other_one_is(name, is
 
 def test_a_task_of_a_map_that_was_built_anew_is_named(copied):
     manifest = copied / "regions" / RIVERSIDE / "region.json"
-    said = json.loads(manifest.read_text(encoding="utf-8"))
-    manifest.write_text(json.dumps(said | {"fingerprint": "0"}), encoding="utf-8")
-    (told,) = check_task(Task.open(copied / "tasks/clean" / RIVERSIDE))
-    assert "town-riverside was built anew since: make the queries again" in told
+    record = json.loads(manifest.read_text(encoding="utf-8"))
+    manifest.write_text(json.dumps(record | {"fingerprint": "0"}), encoding="utf-8")
+    (given,) = check_task(Task.open(copied / "tasks/clean" / RIVERSIDE))
+    assert "town-riverside was built anew since: make the queries again" in given

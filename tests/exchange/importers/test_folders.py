@@ -152,7 +152,7 @@ def test_a_map_in_parts_with_one_row_in_the_table_is_their_mosaic(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "expected"),
     [
         ({"02-01": None}, "09/satellite09.tif is in parts, and 1 part (_02-01) is missing"),
         ({"02-02": (948, 300)}, "sizes that make no grid"),
@@ -160,9 +160,9 @@ def test_a_map_in_parts_with_one_row_in_the_table_is_their_mosaic(tmp_path):
         ({"03-01": (5, 5)}, "1 part (_03-02) is missing"),
     ],
 )
-def test_parts_that_make_no_map_are_refused(changed, told, tmp_path):
+def test_parts_that_make_no_map_are_refused(changed, expected, tmp_path):
     parts = {name: size for name, size in (PARTS | changed).items() if size}
-    assert told in refusal("uav-visloc", in_parts(tmp_path, parts))
+    assert expected in refusal("uav-visloc", in_parts(tmp_path, parts))
 
 
 def test_the_table_of_maps_may_have_a_space_in_its_name(tmp_path):
@@ -366,7 +366,7 @@ def test_a_picture_that_only_names_another_file_is_no_map(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("line", "told"),
+    ("line", "expected"),
     [
         ("a/000000/H80.JPG N30.0 E120.0", "expected '<folder>/<label>/<image> E<longitude> N<latitude> [height]'"),
         ("a/000000/H80.JPG E120.0 N30.0 80 90", "expected '<folder>/<label>/<image>"),
@@ -378,16 +378,16 @@ def test_a_picture_that_only_names_another_file_is_no_map(tmp_path):
         ("<script>\x1b[31m" * 40, "expected '<folder>"),
     ],
 )
-def test_a_wrong_line_of_dense_uav_is_named(line, told, tmp_path):
+def test_a_wrong_line_of_dense_uav_is_named(line, expected, tmp_path):
     root = writers.write_dense(tmp_path, {"000000": (120.0, 30.0)})
     writers.put(root / "Dense_GPS_ALL.txt", line)
     fault = refusal("dense-uav", root)
-    assert told in fault
+    assert expected in fault
     assert "Dense_GPS_ALL.txt" in fault
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "expected"),
     [
         ("num,filename", "filename,filename", "01/01.csv has two columns of one name"),
         (",520.5,", ",tall,", "line 2, height: expected a number, got 'tall'"),
@@ -401,11 +401,11 @@ def test_a_wrong_line_of_dense_uav_is_named(line, told, tmp_path):
         ("01_0001.JPG", "01_0002.JPG", "line 3: '01_0002.JPG' has a row already"),
     ],
 )
-def test_a_wrong_table_of_a_flight_is_named(old, new, told, tmp_path):
+def test_a_wrong_table_of_a_flight_is_named(old, new, expected, tmp_path):
     root = writers.write_visloc(tmp_path)
     table = root / "01" / "01.csv"
     table.write_text(table.read_text().replace(old, new, 1))
-    assert told in refusal("uav-visloc", root)
+    assert expected in refusal("uav-visloc", root)
     writers.put(table, writers.FRAME_COLUMNS + "\n\n")
     assert "01/01.csv names no frame" in refusal("uav-visloc", root)
 
@@ -421,7 +421,7 @@ def test_an_angle_may_be_missing_and_a_date_wrong(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "expected"),
     [
         ("satellite01.tif", "../../etc.tif", "expected a map named satelliteNN.tif, got '../../etc.tif'"),
         ("29.72,116.0,29.7,116.04", "29.7,116.0,29.72,116.04", "LT is the north-west corner"),
@@ -429,11 +429,11 @@ def test_an_angle_may_be_missing_and_a_date_wrong(tmp_path):
         ("RB_lat_map", "south", "has no column 'RB_lat_map'"),
     ],
 )
-def test_a_wrong_row_of_the_table_of_maps_is_named(old, new, told, tmp_path):
+def test_a_wrong_row_of_the_table_of_maps_is_named(old, new, expected, tmp_path):
     root = writers.write_visloc(tmp_path)
     table = root / "satellite_coordinates_range.csv"
     table.write_text(table.read_text().replace(old, new, 1))
-    assert told in refusal("uav-visloc", root)
+    assert expected in refusal("uav-visloc", root)
 
 
 def test_an_unknown_kind_is_told_those_there_are(tmp_path):

@@ -278,7 +278,7 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
 
 
 @pytest.mark.parametrize(
-    ("columns", "told"),
+    ("columns", "expected"),
     [
         ({"query_id": ["q"], "gallery_id": ["g1"]}, "has no column 'rank'"),
         (pa.table([["q"], ["q"], ["g1"], [1]], ["query_id", "query_id", "gallery_id", "rank"]), "or more than one"),
@@ -297,12 +297,12 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
          pa.int64())}), "has no row"),
     ],
 )  # fmt: skip
-def test_a_wrong_ranking_is_refused_in_one_line(columns, told, tmp_path):
+def test_a_wrong_ranking_is_refused_in_one_line(columns, expected, tmp_path):
     dataset = dataset_of("university-1652", {"q": "a"}, {"g1": "a", "g2": "b"})
     pq.write_table(pa.table(columns) if isinstance(columns, dict) else columns, tmp_path / "r.parquet")
     with pytest.raises(DatasetError) as fault:
         read_ranking([tmp_path / "r.parquet"], dataset.items)
-    assert told in str(fault.value)
+    assert expected in str(fault.value)
     assert str(fault.value).isprintable()
 
 

@@ -174,8 +174,11 @@ def test_a_truth_says_where_the_twin_of_its_place_lies(drawn):
     for _, truth in drafts:
         site = next(site for site in made.sites if site.pose == truth.pose)
         east_m, north_m = made.scene.twins[site.index][0]
-        told = (truth.pose.easting_m + truth.measured[TWIN_EAST], truth.pose.northing_m + truth.measured[TWIN_NORTH])
-        np.testing.assert_allclose(told, (east_m, north_m), atol=0.01)
+        twin = (
+            truth.pose.easting_m + truth.measured[TWIN_EAST],
+            truth.pose.northing_m + truth.measured[TWIN_NORTH],
+        )
+        np.testing.assert_allclose(twin, (east_m, north_m), atol=0.01)
 
 
 @pytest.mark.parametrize("name", ["topology-twins", "volatile-lure"])
@@ -188,10 +191,10 @@ def test_the_disc_of_a_query_holds_the_twin_and_its_truth_says_whether_a_search_
         site = next(site for site in made.sites if site.pose == truth.pose)
         for place in (site.en_m, *made.scene.twins[site.index]):
             assert np.hypot(*np.subtract(place, query.prior.center_m)) <= query.prior.radius_m
-        told = truth.measured
-        assert (told["rivals"], told["rivals_in_disc"]) == (1, 1)
+        measured = truth.measured
+        assert (measured["rivals"], measured["rivals_in_disc"]) == (1, 1)
         if truth.role == "stress":
-            is_listed = (told["rivals_listed"], told["truth_listed"]) == (1, 1)
+            is_listed = (measured["rivals_listed"], measured["truth_listed"]) == (1, 1)
             assert truth.kind.startswith("unrivalled ") != is_listed
 
 
@@ -226,14 +229,14 @@ def test_a_truth_says_how_far_outside_of_the_disc_its_view_lies(drawn):
 def test_density_is_of_the_place_that_is_seen_and_likeness_of_the_site_alone(drawn):
     _, _, drafts = drawn("absent")
     for pair in by_site(drafts):
-        told = {truth.kind: truth for _, truth in pair}
-        site = told["control"].feature_density
-        assert told["feature-poor"].feature_density <= 0.003 < site
-        assert told["wrong place"].feature_density == told["wrong place"].measured["density"] != site
-        assert {told[kind].feature_density for kind in ("outside", "corrupted view")} == {site}
-        at_site = {kind for kind, truth in told.items() if truth.alias_index is not None}
-        moved = told["feature-poor"].measured["is_real_place"] == 1
-        assert at_site == set(told) - {"wrong place"} - ({"feature-poor"} if moved else set())
+        values = {truth.kind: truth for _, truth in pair}
+        site = values["control"].feature_density
+        assert values["feature-poor"].feature_density <= 0.003 < site
+        assert values["wrong place"].feature_density == values["wrong place"].measured["density"] != site
+        assert {values[kind].feature_density for kind in ("outside", "corrupted view")} == {site}
+        at_site = {kind for kind, truth in values.items() if truth.alias_index is not None}
+        moved = values["feature-poor"].measured["is_real_place"] == 1
+        assert at_site == set(values) - {"wrong place"} - ({"feature-poor"} if moved else set())
 
 
 def test_a_disc_counts_as_much_as_of_it_is_mapped(drawn):

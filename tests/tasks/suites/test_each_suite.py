@@ -124,10 +124,10 @@ def test_where_the_stress_lies_in_the_view_it_differs_from_the_control(carried, 
     made = carried(name, root)
     for variant in stresses(made):
         # Nothing need be lost in a long message, nor change in a small view in a few years: the truth says so then.
-        told = "cells_changed" if name == "telemetry" else "changed_share"
+        message = "cells_changed" if name == "telemetry" else "changed_share"
         drafts = [(made.drawn(site, variant), made.drawn(site, made.control(variant))) for site in made.sites]
         differs = np.array([(draft.evidence.cells != control.evidence.cells).any() for draft, control in drafts])
-        is_still = np.array([draft.measured.get(told) == 0 for draft, _ in drafts])
+        is_still = np.array([draft.measured.get(message) == 0 for draft, _ in drafts])
         assert not (differs & is_still).any()
         assert differs.any() or is_still.all()  # a detector may overlook the little that changed at one site
         if variant.view_cells >= 192 and name != "telemetry":
@@ -255,8 +255,8 @@ def test_a_place_is_absent_only_where_the_kind_says_so(carried, name, root):
 def test_a_season_is_said_in_the_falsifier_too(carried, root):
     made = carried("season", root)
     for variant in made.suite.variants:
-        said = made.drawn(made.sites[0], variant).season
-        assert said == ("" if variant.role == "control" else variant.kind)
+        given = made.drawn(made.sites[0], variant).season
+        assert given == ("" if variant.role == "control" else variant.kind)
 
 
 def test_seasons_without_anything_to_change_are_left_out(scene):

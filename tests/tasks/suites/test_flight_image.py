@@ -29,8 +29,8 @@ def test_the_evidence_of_each_view_is_unknown_until_its_labels_show_the_map_at_i
             assert (query.evidence.cells == UNKNOWN).all()
             found = truth.labels[0]
             planes = np.where(found.labels == UNKNOWN, 255, found.labels * 254).astype(np.uint8)
-            said = Segmentation(classes=found.classes, probability_bytes=planes)
-            seen = evidence_of(query.frames, [said], size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
+            given = Segmentation(classes=found.classes, probability_bytes=planes)
+            seen = evidence_of(query.frames, [given], size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
             mapped = variant.view(made.airspace.scene.map, truth.pose)
             at, own = seen.classes.index("road_minor"), mapped.classes.index("road_minor")
             known = seen.cells[at] != UNKNOWN

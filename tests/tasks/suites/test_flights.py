@@ -119,11 +119,11 @@ def test_the_odometer_of_a_falsifier_drifts_otherwise(flown, name, root):
 @pytest.mark.parametrize("name", FLIGHT_SUITES)
 def test_what_an_odometer_says_is_the_true_way_but_for_its_drift(flown, name):
     for variant, pairs in flown(name).views.items():
-        said, true = steps(pairs)[1:], true_steps(pairs)
-        is_own = ~np.isnan(said[:, 0])
+        given, true = steps(pairs)[1:], true_steps(pairs)
+        is_own = ~np.isnan(given[:, 0])
         if variant.kind == flights.UNTOLD:
             is_own[len(pairs) // 2 - 1] = False
-        off = np.hypot(*(said - true)[is_own, :2].T) / np.hypot(*true[is_own, :2].T)
+        off = np.hypot(*(given - true)[is_own, :2].T) / np.hypot(*true[is_own, :2].T)
         if name == "flight-clean" and variant.role != "stress":
             assert off.max() < 1e-9
         else:
@@ -187,9 +187,9 @@ def test_a_carried_drone_comes_from_as_far_as_said_and_goes_on_as_the_control(fl
         flown_m = np.diff([truth.measured["distance_m"] for _, truth in pairs])
         assert flown_m[middle - 1] == 0
         assert np.delete(flown_m, middle - 1).min() > 0
-    told, untold = (steps(made.of("stress", kind)) for kind in (flights.TOLD, flights.UNTOLD))
-    assert np.isnan(told[middle]).all()
-    np.testing.assert_array_equal(np.delete(told, middle, axis=0), np.delete(untold, middle, axis=0))
+    given, untold = (steps(made.of("stress", kind)) for kind in (flights.TOLD, flights.UNTOLD))
+    assert np.isnan(given[middle]).all()
+    np.testing.assert_array_equal(np.delete(given, middle, axis=0), np.delete(untold, middle, axis=0))
 
 
 def test_an_odometer_that_is_unaware_of_the_carrying_says_the_step_of_the_control(flown, root):

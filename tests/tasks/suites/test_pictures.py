@@ -64,7 +64,7 @@ def test_every_suite_has_a_control_a_ladder_and_a_falsifier_that_flies_as_the_co
     )
     assert set(other.stops_m) == set(one.stops_m)
     flights = [suite.flight(item) for item in suite.variants if item.role == "stress"]
-    told = {
+    values = {
         (
             item.height_m,
             item.tilt_deg,
@@ -76,7 +76,7 @@ def test_every_suite_has_a_control_a_ladder_and_a_falsifier_that_flies_as_the_co
         )
         for item in flights
     }
-    assert len(told) == len(flights)
+    assert len(values) == len(flights)
 
 
 def test_the_sun_sinks_and_the_air_thickens_along_the_ladder():

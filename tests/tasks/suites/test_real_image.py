@@ -83,10 +83,14 @@ def test_pictures_show_the_place_that_the_truth_names(drawn):
 
 
 def test_variants_are_told_by_the_side_of_their_views_each_once(drawn):
-    told = [(truth.role, truth.kind, truth.strength) for _, truth in pairs(drawn)]
+    kinds = [(truth.role, truth.kind, truth.strength) for _, truth in pairs(drawn)]
     sites = len({truth.pair_id for _, truth in pairs(drawn)})
-    assert set(told) == {("control", "control", 0.0), ("falsifier", "turned picture", 0.0), ("stress", "R1 view", 64.0)}
-    assert len(told) == 3 * sites
+    assert set(kinds) == {
+        ("control", "control", 0.0),
+        ("falsifier", "turned picture", 0.0),
+        ("stress", "R1 view", 64.0),
+    }
+    assert len(kinds) == 3 * sites
     assert {truth.detector for _, truth in pairs(drawn)} == {"real"}
     worse = [(truth.kind, truth.strength) for _, truth in pairs(drawn, DEGRADED_MAP)]
     assert set(worse) == {(DEGRADED, 96.0), (DEGRADED, 64.0)}

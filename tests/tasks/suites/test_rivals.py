@@ -127,18 +127,18 @@ def measure(state, prior=PRIOR):
 
 
 def test_a_search_lists_a_place_and_its_copy_with_about_one_score():
-    told = measure(town())
-    assert (told["rivals"], told["rivals_in_disc"], told["rivals_listed"], told["truth_listed"]) == (1, 1, 1, 1)
-    assert told["rival_lead"] == pytest.approx(0, abs=0.01)
-    assert kind_of("stress", "G2", told) == "G2"
+    given = measure(town())
+    assert (given["rivals"], given["rivals_in_disc"], given["rivals_listed"], given["truth_listed"]) == (1, 1, 1, 1)
+    assert given["rival_lead"] == pytest.approx(0, abs=0.01)
+    assert kind_of("stress", "G2", given) == "G2"
 
 
 def test_a_rival_that_no_search_would_list_makes_a_stress_another_kind():
-    told = measure(town(rival=False))
-    assert (told["rivals_listed"], told["truth_listed"]) == (0, 1)
-    assert "rival_lead" not in told
-    assert kind_of("stress", "G2", told) == "unrivalled G2"
-    assert {kind_of(role, "k", told) for role in ("control", "falsifier")} == {"k"}
+    given = measure(town(rival=False))
+    assert (given["rivals_listed"], given["truth_listed"]) == (0, 1)
+    assert "rival_lead" not in given
+    assert kind_of("stress", "G2", given) == "unrivalled G2"
+    assert {kind_of(role, "k", given) for role in ("control", "falsifier")} == {"k"}
 
 
 def test_a_place_that_no_search_would_list_makes_a_stress_another_kind_too():
@@ -146,14 +146,14 @@ def test_a_place_that_no_search_would_list_makes_a_stress_another_kind_too():
     full = replace(
         state, bits=LayerBits(bits=np.where(np.arange(600)[:, None] < 220, np.uint32(3), state.bits.bits), count=2)
     )
-    told = RivalCheck().measure(full, seen(state), PRIOR, truth_m=PLACE, rivals_m=[RIVAL])
-    assert (told["rivals_listed"], told["truth_listed"]) == (1, 0)
-    assert kind_of("stress", "S2", told) == "unrivalled S2"
+    given = RivalCheck().measure(full, seen(state), PRIOR, truth_m=PLACE, rivals_m=[RIVAL])
+    assert (given["rivals_listed"], given["truth_listed"]) == (1, 0)
+    assert kind_of("stress", "S2", given) == "unrivalled S2"
 
 
 def test_a_rival_outside_the_disc_is_counted_as_such():
-    told = measure(town(), replace(PRIOR, center_m=(152.0, 444.0), radius_m=60.0))
-    assert (told["rivals_in_disc"], told["rivals_listed"], told["truth_listed"]) == (0, 0, 1)
+    given = measure(town(), replace(PRIOR, center_m=(152.0, 444.0), radius_m=60.0))
+    assert (given["rivals_in_disc"], given["rivals_listed"], given["truth_listed"]) == (0, 0, 1)
 
 
 def test_the_score_of_a_view_without_error_is_one_at_its_place_and_that_of_its_opposite_negative():

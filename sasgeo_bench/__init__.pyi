@@ -150,14 +150,14 @@ from .tasks.query import Query as Query
 from .tasks.query import Step as Step
 from .tasks.query import Truth as Truth
 from .tasks.suites.base import VIEW_CELLS as VIEW_CELLS
-from .tasks.suites.base import QueryDraft as QueryDraft
 from .tasks.suites.base import PlainSuite as PlainSuite
+from .tasks.suites.base import QueryDraft as QueryDraft
 from .tasks.suites.base import Scene as Scene
-from .tasks.suites.base import ViewRequest as ViewRequest
 from .tasks.suites.base import Site as Site
 from .tasks.suites.base import Suite as Suite
 from .tasks.suites.base import SuiteCard as SuiteCard
 from .tasks.suites.base import Variant as Variant
+from .tasks.suites.base import ViewRequest as ViewRequest
 from .tasks.suites.base import controls as controls
 from .tasks.suites.base import ladder as ladder
 from .tasks.task_files import Task as Task

@@ -60,7 +60,7 @@ from sasgeo_bench.scoring.entries import (
     scored_rows,
     set_apart,
 )
-from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metrics, measured
+from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metrics, with_metrics
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA, protection_frame
 from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, Rule, evaluate_rejectors, rules_of
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, base_name, with_entry_labels
@@ -86,26 +86,28 @@ def score_board(request: ScoreRequest) -> Scored:
     rules, metrics = rules_of(request.rejectors, request.split), find_metrics(request.metrics)
     failures = Failures(log_beside(request.board), is_reported=False)  # reported with the board, or raised
     ranks = None
-    while ranks is None:  # once more for each time that the comparison of entries fails because of some of them
-        contest = _scored_entries(request, failures)
-        controls = evaluate_controls(contest.scores)
-        scored = scored_rows(contest, request.split)
-        scores = rows_to_rank(scored, request.split)
-        entries = [item.entry for item in contest.answers if item.entry.name in scores]
+    # Entries are compared together. If that fails because of some of them, these are noted as failed, and not loaded
+    # again.
+    while ranks is None:
+        loaded = _scored_entries(request, failures)
+        controls = evaluate_controls(loaded.scores)
+        with_calibration = scored_rows(loaded, request.split)
+        scores = rows_to_rank(with_calibration, request.split)
+        entries = [item.entry for item in loaded.answers if item.entry.name in scores]
         excluded = set_apart(entries, scores, request.split, controls)
-        tasks = tuple(task.manifest for task in contest.tasks)
+        tasks = tuple(task.manifest for task in loaded.tasks)
         on_private = score_private(request, entries=entries, scores=scores, tasks=tasks)
         ranks = _ranks(scores, excluded, request.draws, metrics, failures)
-    predictions = {item.entry.name: item.predictions for item in contest.answers}
-    views = _of_rows(contest.views, scores)
-    costs = _costs(entries, scores, views, contest.tasks, failures)
-    rejection = _rejection(request, rules, entries, scored, predictions, failures)
-    falsifiers, findings = _tested(request, scores, rejection, failures)
-    protection = _protection(scored, scores, predictions, request.split, failures)
-    records = [_entry_of(entry, excluded.get(entry.name), on_private, controls) for entry in entries]
+    predictions = {item.entry.name: item.predictions for item in loaded.answers}
+    views = _views_of(loaded.views, scores)
+    costs = _costs(entries, scores, views, loaded.tasks, failures)
+    rejection = _rejection(request, rules, entries, with_calibration, predictions, failures)
+    falsifiers, findings = _falsifiers_and_findings(request, scores, rejection, failures)
+    protection = _protection(with_calibration, scores, predictions, request.split, failures)
+    records = [_entry_record(entry, excluded.get(entry.name), on_private, controls) for entry in entries]
     board = Board(
         folder=request.board,
-        about=_record_of(
+        about=_manifest_of(
             request,
             tasks,
             records,
@@ -125,19 +127,19 @@ def score_board(request: ScoreRequest) -> Scored:
         acceptance=rejection.acceptance,
         protection=protection,
     )
-    truths = {truth.query_id: truth for task in contest.tasks for truth in task.truths}
+    truths = {truth.query_id: truth for task in loaded.tasks for truth in task.truths}
     return Scored(
         board=board,
-        entries=tuple(item.entry for item in contest.answers),
+        entries=tuple(item.entry for item in loaded.answers),
         tasks=tasks,
         predictions=predictions,
         scores=scores,
-        with_calibration=scored,
+        with_calibration=with_calibration,
         views=views,
         judged={key: frame for key, frame in rejection.judged.items() if len(frame)},
         falsifiers=falsifiers,
         truths=truths,
-        measured={name: truth.measured for name, truth in truths.items()} | _of_flights(contest.tasks),
+        measured={name: truth.measured for name, truth in truths.items()} | _measured_of_flights(loaded.tasks),
         failures=failures,
     )
 
@@ -166,7 +168,7 @@ def _ranks(
     failures: Failures,
 ) -> list[pd.DataFrame] | None:
     """Return the figures of all entries together; None if one of them fails, which is noted."""
-    frames, more = measured(metrics, scores)
+    frames, more = with_metrics(metrics, scores)
     compare = partial(leaderboards, draws=draws, excluded=excluded, more=more)
     try:
         return compare(frames)
@@ -214,13 +216,13 @@ def _rejection(
     )
 
 
-def _tested(
+def _falsifiers_and_findings(
     request: ScoreRequest, scores: Mapping[str, pd.DataFrame], rejection: RejectionResult, failures: Failures
 ) -> tuple[tuple[Falsifier, ...], tuple[Finding, ...]]:
     """Return the falsifiers and the registered contrasts; those of a stored board stand as they are."""
     failed, draws = failures.found, request.draws
-    held = [item for item in request.contrasts if {item.first, item.second} <= scores.keys() or not failed]
-    falsifiers = evaluate_falsifiers(held, scores, draws=draws)
+    complete = [item for item in request.contrasts if {item.first, item.second} <= scores.keys() or not failed]
+    falsifiers = evaluate_falsifiers(complete, scores, draws=draws)
     if request.stored is not None:
         return falsifiers, request.stored.findings
     findings = evaluate_contrasts(request.contrasts, scores, rejection.judged, draws=draws, failed=failed)
@@ -316,7 +318,7 @@ def _protection(
     return pd.concat(some, ignore_index=True) if some else PROTECTION_SCHEMA.empty()
 
 
-def _of_flights(tasks: Sequence[Task]) -> dict[str, Mapping[str, float]]:
+def _measured_of_flights(tasks: Sequence[Task]) -> dict[str, Mapping[str, float]]:
     """Return what was measured at the first view of each flight by the flight's id."""
     flown = [task for task in tasks if task.manifest.is_of_flights]
     firsts = {head.query_id: head.sequence_id for task in flown for head in task.heads() if head.frame == 0}
@@ -324,7 +326,7 @@ def _of_flights(tasks: Sequence[Task]) -> dict[str, Mapping[str, float]]:
     return {str(firsts[truth.query_id]): truth.measured for truth in truths if truth.query_id in firsts}
 
 
-def _of_rows(views: Mapping[str, pd.DataFrame], scores: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+def _views_of(views: Mapping[str, pd.DataFrame], scores: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
     """Return the views of the flights that are among scored rows."""
     return {
         name: frame[frame["sequence_id"].isin(scores[name]["query_id"])].reset_index(drop=True)
@@ -336,7 +338,7 @@ def _of_rows(views: Mapping[str, pd.DataFrame], scores: Mapping[str, pd.DataFram
 # --- the manifest ----------------------------------------------------------------------------------------------------
 
 
-def _record_of(
+def _manifest_of(
     request: ScoreRequest,
     tasks: Sequence[TaskManifest],
     entries: Sequence[BoardEntry],
@@ -386,7 +388,9 @@ def _metric_of(found: ForeignMetric) -> MetricRecord:
     return MetricRecord(**words, code=found.code, sha256=found.sha256, least=least, greatest=greatest, tracks=tracks)
 
 
-def _entry_of(entry: Entry, set_apart: str | None, on_private: OnPrivate, controls: Sequence[Verdict]) -> BoardEntry:
+def _entry_record(
+    entry: Entry, set_apart: str | None, on_private: OnPrivate, controls: Sequence[Verdict]
+) -> BoardEntry:
     """Return what a board says of an entry: why it is set apart, if it is, and how it fared on a private seed."""
     return BoardEntry(
         name=entry.name,

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
 from sasgeo_bench.boards.cases import FAILURES, MEANINGS
 from sasgeo_bench.boards.manifests import BoardTask, RegionMap
-from sasgeo_bench.boards.plots import FAINT, BoardPage, line_keys, look_of
+from sasgeo_bench.boards.plots import FAINT, BoardPage, Look, line_keys, look_of
 from sasgeo_bench.boards.site_files import MAPS, SiteSource, Spot
 from sasgeo_bench.boards.tables import (
     Cell,
@@ -235,14 +235,8 @@ def draw_rates(path: Path, book: RateBook) -> None:
         ):
             for at, name in enumerate(names):
                 for number, place in enumerate(book.places):
-                    rate = getattr(place.classes.get(name), column, None)
-                    if rate is not None:
-                        y, look = at + _STEP * (number - (len(book.places) - 1) / 2), look_of(number)
-                        ends = [float(np.clip(100 * one, *_RATES)) for one in (rate.lo, rate.hi) if one is not None]
-                        if len(ends) > 1:
-                            chart.hlines(y, ends[0], ends[1], color=look.colour, lw=0.9)
-                        best = float(np.clip(100 * rate.best, *_RATES))
-                        chart.plot(best, y, marker=look.mark, ms=3.2, color=look.colour, ls="")
+                    y = at + _STEP * (number - (len(book.places) - 1) / 2)
+                    _draw_rate(chart, getattr(place.classes.get(name), column, None), y=y, look=look_of(number))
             chart.set_title(title)
             chart.set_xscale("log")
             chart.set_xlim(_RATES[0] * 0.8, _RATES[1] * 1.2)
@@ -252,6 +246,15 @@ def draw_rates(path: Path, book: RateBook) -> None:
             chart.tick_params(axis="y", length=0)
             chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
         charts[0][1].set_yticklabels([])
+
+
+def _draw_rate(chart: Axes, rate: Estimate | None, *, y: float, look: Look) -> None:
+    if rate is None:
+        return
+    ends = [float(np.clip(100 * one, *_RATES)) for one in (rate.lo, rate.hi) if one is not None]
+    if len(ends) > 1:
+        chart.hlines(y, ends[0], ends[1], color=look.colour, lw=0.9)
+    chart.plot(float(np.clip(100 * rate.best, *_RATES)), y, marker=look.mark, ms=3.2, color=look.colour, ls="")
 
 
 # --- the page with the answers ---

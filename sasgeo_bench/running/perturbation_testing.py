@@ -180,8 +180,10 @@ class _Kit:
         for value in NO_STRENGTHS:
             try:
                 self.ladder.at(value)
-            except Exception:  # whatever it says  # noqa: BLE001, S112
+            except (ValueError, TypeError):
                 continue
+            except Exception as error:  # noqa: BLE001 - of another's code
+                return f"{value!r} for a strength makes it fail ({message_of(error)}): refuse it as a ValueError"
             return f"it takes {value!r} for a strength: check_ranges(self, {self.ladder.knob}=(0, 1)) refuses it"
         return None
 

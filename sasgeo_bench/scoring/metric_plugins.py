@@ -181,7 +181,7 @@ def _asked(function: Callable[[pd.DataFrame], object], rows: pd.DataFrame, what:
     return numbers if found.dtype.kind == "O" else np.asarray(found)
 
 
-def measured(
+def with_metrics(
     found: Sequence[ForeignMetric], scores: Mapping[str, pd.DataFrame]
 ) -> tuple[dict[str, pd.DataFrame], tuple[MeanMetric, ...]]:
     """Measure scored rows by matcher with metrics of other packages; return the rows with a column for each of them.

@@ -98,6 +98,16 @@ class Unchecked:
         return Stripes(share=min(float(self.share), 1.0))(evidence, rng)
 
 
+@dataclass(frozen=True)
+class Stumbles(Stripes):
+    """Takes a strength that is no number for one, and falls over it."""
+
+    def __post_init__(self):
+        if not hasattr(self.share, "real") or isinstance(self.share, bool):
+            self.share.nothing  # noqa: B018
+        super().__post_init__()
+
+
 @pytest.mark.parametrize(
     ("rule", "one"),
     [
@@ -112,6 +122,7 @@ class Unchecked:
         ("takes views of one class, and of any shape", Large),
         ("changes some cells", Idle),
         ("refuses what is no strength", Unchecked),
+        ("refuses what is no strength", Stumbles),
     ],
 )
 def test_a_perturbation_that_breaks_a_rule_fails_there(named, tmp_path, rule, one):

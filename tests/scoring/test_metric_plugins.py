@@ -13,7 +13,7 @@ import pytest
 
 import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import ConfigError, MatchError, MetricError
-from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metric, find_metrics, measured
+from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metric, find_metrics, with_metrics
 from sasgeo_bench.scoring.metric_testing import check_metric, metric_files
 from sasgeo_bench.scoring.tables import leaderboard
 from tests.scoring.test_tables import scores
@@ -162,7 +162,7 @@ def stop(_):
 )
 def test_a_metric_that_fails_on_answers_is_named_in_one_line_and_nothing_is_compared(values, fault):
     with pytest.raises(MetricError) as raised:
-        measured(foreign(metric(values)), {"mine": scores([0.0, 1.0, 30.0, 99.0])})
+        with_metrics(foreign(metric(values)), {"mine": scores([0.0, 1.0, 30.0, 99.0])})
     assert str(raised.value).startswith(f"mine:0, on the answers of mine (localization): {fault}")
     assert "\n" not in str(raised.value)
 
@@ -180,16 +180,16 @@ def test_a_metric_that_fails_on_answers_is_named_in_one_line_and_nothing_is_comp
 )
 def test_a_mask_of_no_bools_or_of_other_rows_is_refused(counts, fault):
     with pytest.raises(MetricError, match=f"^mine:0, on the answers of mine .localization.: {fault}"):
-        measured(foreign(metric(counts=counts)), {"mine": scores([0.0, 99.0])})
+        with_metrics(foreign(metric(counts=counts)), {"mine": scores([0.0, 99.0])})
 
 
 def test_what_counts_may_not_depend_on_the_answer():
     asked = {"good": scores([0.0, 1.0]), "bad": scores([0.0, 99.0])}
     chosen = metric(lambda rows: np.where(rows["is_right"], 1.0, np.nan))
     with pytest.raises(MetricError, match=r"^mine:0: query q00001 counts for good, and not for bad: what counts may"):
-        measured(foreign(chosen), asked)
+        with_metrics(foreign(chosen), asked)
     asked["bad"]["status"] = "not applicable"  # its card excludes all of it
-    frames, _ = measured(foreign(chosen), asked)
+    frames, _ = with_metrics(foreign(chosen), asked)
     assert frames["bad"]["metric near"].isna().all()
 
 
@@ -200,7 +200,7 @@ def test_its_rows_stand_beside_ours_which_stay_what_they_are_to_the_last_digit(v
     asked = {"good": scores([0.0, 5.0, 27.5, 40.0]), "bad": scores([27.5, 99.0, math.inf, 12.0])}
     kept = {name: frame.copy() for name, frame in asked.items()}
     plain = leaderboard(asked, draws=100)
-    frames, more = measured(foreign(metric(values)), asked)
+    frames, more = with_metrics(foreign(metric(values)), asked)
     whole = leaderboard(frames, draws=100, more=more)
     pd.testing.assert_frame_equal(whole[whole["metric"] != "near"].reset_index(drop=True), plain)
     for name, frame in kept.items():
@@ -215,14 +215,14 @@ def test_its_rows_stand_beside_ours_which_stay_what_they_are_to_the_last_digit(v
 def test_a_function_that_writes_into_its_rows_moves_no_figure():
     asked = {"mine": scores([0.0, 99.0])}
     plain = leaderboard(asked, draws=100)
-    frames, more = measured(foreign(metric(values_in_place)), asked)
+    frames, more = with_metrics(foreign(metric(values_in_place)), asked)
     whole = leaderboard(frames, draws=100, more=more)
     pd.testing.assert_frame_equal(whole[whole["metric"] != "near"].reset_index(drop=True), plain)
 
 
 def test_queries_that_do_not_count_are_in_no_denominator():
     half = metric(lambda rows: np.where(np.arange(len(rows)) % 2 == 0, near(rows), np.nan))
-    frames, more = measured(foreign(half), {"mine": scores([0.0, 99.0, 27.5, 99.0])})
+    frames, more = with_metrics(foreign(half), {"mine": scores([0.0, 99.0, 27.5, 99.0])})
     rows = leaderboard(frames, draws=100, more=more)
     row = rows[(rows["metric"] == "near") & (rows["stratum"] == "all")].iloc[0]
     assert (row["n"], row["value"]) == (2, pytest.approx(0.75))

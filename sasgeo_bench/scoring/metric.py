@@ -45,7 +45,8 @@ class MeanMetric(Metric):
 
     `values` maps scored rows (`scores.parquet`) to one number for each; of a metric of another package NaN leaves a
     query out. `counts` maps them to a mask of the denominator, by default all. The denominator is the same for every
-    matcher: whether a query counts may depend on the query and its truth, never on the answer.
+    matcher: whether a query counts may depend on the query and its truth, never on the answer. One that no answer does
+    not spoil, as a share of false fixes, names in `read_with` the metric of the track that counts no answers.
 
     Examples
     --------
@@ -60,6 +61,7 @@ class MeanMetric(Metric):
     values: Callable[[pd.DataFrame], Floats]
     counts: Callable[[pd.DataFrame], Bools] = every_row
     is_primary: bool = False
+    read_with: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -113,6 +113,7 @@ def _silence(metric: MeanMetric) -> str | None:
         "(0.0, 1.0)": not _are_bounds(metric.bounds),
         f"tracks are {_shown(metric.tracks)}, expected some of {TRACKS}": not are_tracks,
         "is_primary is true, and boards rank by metrics that ship alone: leave it out": metric.is_primary,
+        "read_with is no name of a metric": not isinstance(metric.read_with, str),
         "values is no function of scored rows": not callable(metric.values),
         "counts is no function of scored rows": not callable(metric.counts),
     }

@@ -84,9 +84,11 @@ MEANS: Final = (
         for near_m in WITHIN_M
     ),
     _flight_mean("right_accepted", "Share of the views with an accepted fix within 25 m", better="higher"),
-    _flight_mean("false_accepted", "Share of the views with an accepted fix beyond 25 m"),
+    _flight_mean("false_accepted", "Share of the views with an accepted fix beyond 25 m", read_with="right_accepted"),
     _flight_mean(
-        "false_of_accepted", "Share of a flight's accepted fixes that are beyond 25 m; 0 where none is accepted"
+        "false_of_accepted",
+        "Share of a flight's accepted fixes that are beyond 25 m; 0 where none is accepted",
+        read_with="right_accepted",
     ),
     _amount(
         "right_per_km",
@@ -94,7 +96,12 @@ MEANS: Final = (
         unit="1/km",
         better="higher",
     ),
-    _amount("false_per_km", "Accepted fixes beyond 25 m for each flown kilometre, of about 20 views", unit="1/km"),
+    _amount(
+        "false_per_km",
+        "Accepted fixes beyond 25 m for each flown kilometre, of about 20 views",
+        unit="1/km",
+        read_with="right_per_km",
+    ),
     _amount(
         "longest_without_fix_m",
         "Longest stretch of a flight without an accepted fix within 25 m; the whole flight if there is none",
@@ -104,6 +111,7 @@ MEANS: Final = (
         "divergences",
         "Stretches of a flight, more than 500 m long, with accepted fixes that are all more than 100 m off. A tracker "
         "that accepts nothing has none",
+        read_with="right_accepted",
     ),
     _flight_mean(
         "reacquired_500m",

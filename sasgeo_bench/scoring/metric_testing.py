@@ -144,9 +144,10 @@ class _Kit:
                 (_MISSES, partial(self.misses, values), f"worst: {self.metric.worst:g}"),
             )
         ):
+            named = replace(rule, name=f"{self.track}: {rule.name}")
             is_excused = rule.name == _MISSES and rule.outcome == "pass" and self.metric.read_with
-            found = {"outcome": "not applicable", "found": f"read with {self.metric.read_with}"} if is_excused else {}
-            yield replace(rule, name=f"{self.track}: {rule.name}", **found)
+            other = f"read with {self.metric.read_with}"
+            yield replace(named, outcome="not applicable", found=other) if is_excused else named
 
     def changes_nothing(self) -> str | None:
         for name, frame in self.scores.items():

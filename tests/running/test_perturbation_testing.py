@@ -149,7 +149,7 @@ def test_a_sound_class_instance_or_function_of_a_strength_keeps_every_rule(named
 def test_a_mask_that_is_none_is_told_once(named, tmp_path, given, expected):
     one = type("Masked", (sgb.Occlusion,), {"mask": lambda _, view, __: given(view)})
     lines = [row.found for row in check_perturbation(named(one), out=tmp_path) if row.outcome == "fail"]
-    assert lines[0].startswith(f"PerturbError: Masked: mask() returned {expected}")
+    assert lines[0].startswith(f"PerturbError: Masked: the mask of what to hide is {expected}")
     assert ", expected an array of bool of shape (" in lines[0]
     assert sum("mask()" in line for line in lines) <= 2  # views of odd shapes are told apart
 

@@ -50,7 +50,18 @@ def with_cells(evidence: Evidence, cells: NDArray[np.uint8]) -> Evidence:
 
 
 def hide(evidence: Evidence, mask: Mask) -> Evidence:
-    """Make the cells of a mask unknown; its shape is (rows, cols) for all classes or (C, rows, cols)."""
+    """Make the cells of a mask unknown; its shape is (rows, cols) for all classes or (C, rows, cols).
+
+    Raise `PerturbError` if it is of another shape, or no array of bool.
+    """
+    shapes = (evidence.shape, evidence.cells.shape)
+    given: object = mask
+    if not isinstance(given, np.ndarray) or given.dtype != bool or given.shape not in shapes:
+        what = f"{given.dtype} of shape {given.shape}" if isinstance(given, np.ndarray) else typed(given)
+        raise PerturbError(
+            f"the mask of what to hide is {what}, expected an array of bool of shape {shapes[0]}, or {shapes[1]} for "
+            "each class its own"
+        )
     return evidence.replace(np.maximum(evidence.cells, mask.view(np.uint8) * np.uint8(UNKNOWN)), evidence.confidence)
 
 
@@ -67,15 +78,10 @@ class Occlusion(ABC):
         """Hide the cells of `mask`."""
         if self.share == 0:
             return evidence
-        mask: object = self.mask(evidence, rng)
-        shapes = (evidence.shape, evidence.cells.shape)
-        if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape not in shapes:
-            given = f"{mask.dtype} of shape {mask.shape}" if isinstance(mask, np.ndarray) else typed(mask)
-            raise PerturbError(
-                f"{type(self).__name__}: mask() returned {given}, expected an array of bool of shape {shapes[0]}, or "
-                f"{shapes[1]} for each class its own"
-            )
-        return hide(evidence, mask)
+        try:
+            return hide(evidence, self.mask(evidence, rng))
+        except PerturbError as error:
+            raise PerturbError(f"{type(self).__name__}: {error}") from error
 
     @abstractmethod
     def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:

@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sasgeo_bench.core.errors import PerturbError
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.base import share_hidden
+from sasgeo_bench.tasks.perturbations.base import hide, share_hidden
 from sasgeo_bench.tasks.perturbations.occlusion import (
     HIDDEN,
     MASKS,
@@ -131,3 +132,22 @@ def test_false_unknowns_lie_together_and_differ_between_classes():
     together = (mask[:, :, 1:] & mask[:, :, :-1]).sum() / mask[:, :, 1:].sum()
     assert together > 0.85  # cells drawn one by one: 0.2
     assert np.corrcoef(mask[0].ravel(), mask[1].ravel())[0, 1] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("mask", "what"),
+    [
+        (np.ones((3, 3)), "float64 of shape (3, 3)"),
+        (np.ones((2, 2), dtype=bool), "bool of shape (2, 2)"),
+        ([True], "list"),
+    ],
+        (np.ones((3, 3)), "float64 of shape (3, 3)"),
+        (np.ones((2, 2), dtype=bool), "bool of shape (2, 2)"),
+        ([True], "list"),
+    ],
+)
+def test_what_is_no_mask_of_the_view_is_refused_in_one_line(mask, what):
+    view = Evidence(classes=("water",), cells=np.zeros((1, 3, 3), dtype=np.uint8), cell_size_m=1.0)
+    with pytest.raises(PerturbError, match=r"expected an array of bool of shape \(3, 3\), or \(1, 3, 3\)") as caught:
+        hide(view, mask)
+    assert what in str(caught.value)

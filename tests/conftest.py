@@ -26,7 +26,7 @@ from sasgeo_bench.boards import board_pictures, build
 from sasgeo_bench.boards.board_figures import figures_extra
 from sasgeo_bench.boards.board_files import AdditionalFiles
 from sasgeo_bench.core import progress
-from sasgeo_bench.experiments import pipeline
+from sasgeo_bench.experiments import pipeline_plan
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.testing import TinyPlace, tiny_place
@@ -292,8 +292,8 @@ def plain_site(monkeypatch: pytest.MonkeyPatch) -> None:
 def few_controls() -> Iterator[None]:
     """Pipelines draw their controls at one site of one town: what these find is tested beside their suite."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "CONTROL_REGIONS", ("town-suburb",))
-        patch.setattr(pipeline, "CONTROL_SITES", 1)
+        patch.setattr(pipeline_plan, "CONTROL_REGIONS", ("town-suburb",))
+        patch.setattr(pipeline_plan, "CONTROL_SITES", 1)
         yield
 
 

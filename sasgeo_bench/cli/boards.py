@@ -32,7 +32,8 @@ from sasgeo_bench.core.errors import ConfigError, StoreError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.exchange.submissions import submissions_for
 from sasgeo_bench.experiments.head_start import packed_for, unpack_head_start
-from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.running.failures import log_beside
 from sasgeo_bench.scoring.intervals import DRAWS

@@ -15,7 +15,8 @@ from sasgeo_bench.core.errors import ConfigError, StoreError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.exchange.release_files import BoardTasks
 from sasgeo_bench.experiments.entry_cost import fetch_extracts
-from sasgeo_bench.experiments.pipeline import PipelinePlan, draw_all, plan_pipeline
+from sasgeo_bench.experiments.pipeline import draw_all
+from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, plan_pipeline
 from sasgeo_bench.regions.build import package_version
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.tasks.private_seed import PrivateSeed

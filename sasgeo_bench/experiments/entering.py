@@ -24,7 +24,8 @@ from sasgeo_bench.exchange.submissions import (
 )
 from sasgeo_bench.experiments import entry_cost
 from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, plan_board, same_queries
-from sasgeo_bench.experiments.pipeline import PipelinePlan, Run, ask, draw_all, plan_runs
+from sasgeo_bench.experiments.pipeline import ask, draw_all
+from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, Run, plan_runs
 from sasgeo_bench.matching.matcher import SOUND, MatcherCard, Prediction
 from sasgeo_bench.matching.submission import NONE, Card
 from sasgeo_bench.running.plan import RunPlan

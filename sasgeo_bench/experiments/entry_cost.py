@@ -15,7 +15,7 @@ from sasgeo_bench.boards.board_files import MEND, read_board_manifest, read_scor
 from sasgeo_bench.core.errors import ConfigError, ExtractError, StoreError, counted
 from sasgeo_bench.core.parquet import read_table
 from sasgeo_bench.core.progress import duration_text
-from sasgeo_bench.experiments.pipeline import PipelinePlan
+from sasgeo_bench.experiments.pipeline_plan import PipelinePlan
 from sasgeo_bench.matching.matcher import is_followed
 from sasgeo_bench.osm.locate import FOLDERS_VARIABLE, find_extract, find_parts, missing_files
 from sasgeo_bench.running import prediction_files

@@ -26,7 +26,8 @@ from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.parquet import read_frame
 from sasgeo_bench.core.progress import reporting
-from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.tasks.query import base_of

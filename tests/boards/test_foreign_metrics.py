@@ -17,7 +17,7 @@ from sasgeo_bench.core.config import ConfigError
 from sasgeo_bench.core.errors import MatchError, MetricError
 from sasgeo_bench.core.plugins import plugin_code
 from sasgeo_bench.core.progress import reporting
-from sasgeo_bench.experiments.pipeline import plan_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.scoring.metric_testing import metric_files
 from tests import world
 

@@ -25,7 +25,7 @@ from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.exchange.release import ReleaseRequest, make_release
-from sasgeo_bench.experiments.pipeline import plan_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.running import sandbox
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run

@@ -18,7 +18,8 @@ from sasgeo_bench.exchange.release import ReleaseRequest, make_release
 from sasgeo_bench.exchange.submissions import SubmitRequest, hold_submission, make_submission
 from sasgeo_bench.experiments import board_queries
 from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, draw_board
-from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.matching.submission import Card, example_card
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.task_plan import Request

@@ -23,7 +23,8 @@ from sasgeo_bench.exchange.submissions import beside_stored, hold_submission, wi
 from sasgeo_bench.experiments import board_queries, entering, entry_cost
 from sasgeo_bench.experiments.board_queries import asked_tasks, same_queries
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, plan_entry
-from sasgeo_bench.experiments.pipeline import ask, draw_all, plan_pipeline, plan_runs, run_pipeline
+from sasgeo_bench.experiments.pipeline import ask, draw_all, run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline, plan_runs
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.regions.region import DATA_VERSION

@@ -10,8 +10,9 @@ from sasgeo_bench.boards.pipeline_spec import PipelineFile
 from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.progress import reporting
-from sasgeo_bench.experiments import pipeline
-from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.experiments import pipeline_plan
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from tests.handmade import split_file
 
 pytestmark = pytest.mark.usefixtures("in_threads", "without_drawings", "few_controls")
@@ -119,9 +120,9 @@ def test_without_learning_train_places_are_left_out_in_one_line(plan_of):
 
 
 def test_controls_are_drawn_where_nothing_trains(plan_of, tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "CONTROL_REGIONS", ("town-riverside", TRAIN))
+    monkeypatch.setattr(pipeline_plan, "CONTROL_REGIONS", ("town-riverside", TRAIN))
     assert {item.region.id for item in plan_of().controls} == {"town-riverside"}
-    monkeypatch.setattr(pipeline, "CONTROL_REGIONS", (TRAIN,))
+    monkeypatch.setattr(pipeline_plan, "CONTROL_REGIONS", (TRAIN,))
     (control,) = plan_of().controls
     assert control.region.id.startswith("town-")
     assert control.region.id != TRAIN

@@ -19,8 +19,9 @@ from sasgeo_bench.boards.pipeline_spec import (
 from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError, MatchError
 from sasgeo_bench.core.progress import reporting
-from sasgeo_bench.experiments import pipeline
-from sasgeo_bench.experiments.pipeline import is_asked, plan_pipeline, run_pipeline
+from sasgeo_bench.experiments import pipeline, pipeline_plan
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import is_asked, plan_pipeline
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.tasks import build as tasks
 from sasgeo_bench.tasks import task_files
@@ -674,14 +675,14 @@ def test_a_matcher_that_cannot_be_made_costs_nobody_the_board(made, tmp_path, mo
 
 def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch):
     plan, board, _ = made
-    work = pipeline.plan_run
+    work = pipeline_plan.plan_run
 
     def broken(request):
         if request.spec == "random":
             raise KeyError("a mistake of ours")
         return work(request)
 
-    monkeypatch.setattr(pipeline, "plan_run", broken)
+    monkeypatch.setattr(pipeline_plan, "plan_run", broken)
     beside = run_pipeline(plan)
     assert set(beside.scores) == set(board.scores) - {"random"}
     assert [item.verdict for item in beside.board.findings] == ["not decided: random failed"]

@@ -16,7 +16,8 @@ from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.experiments import sealed
-from sasgeo_bench.experiments.pipeline import TrainingGroups, plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import TrainingGroups, plan_pipeline
 from sasgeo_bench.experiments.sealed import open_seal
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks

@@ -13,7 +13,8 @@ from sasgeo_bench.boards.board_files import check_board
 from sasgeo_bench.boards.pipeline_spec import PipelineFile
 from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.progress import reporting
-from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files
 from tests.threaded import threaded

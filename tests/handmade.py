@@ -203,7 +203,7 @@ def put_pictures(folder, *, failures=("aliased", "occluded", "odd one"), **chang
         "cases": [
             {"query_id": f"q{at}", "matcher": "graph", "failure": failure, "file": f"cases/{at}.png"}
             | {"suite": "real-age", "region": "vaduz", "kind": "S1", "alt": f"Case {at}"}
-            | {"said": {"error (m)": 412.5, "note": MARKUP}}
+            | {"facts": {"error (m)": 412.5, "note": MARKUP}}
             for at, failure in enumerate(failures)
         ],
     }

@@ -299,7 +299,7 @@ def _add_cases(
             "cases",
             f"{case.matcher}-{case.query.query_id}",
             partial(_picture, outcome),
-            partial(FailedCase, **{name: row[name] for name in COLUMNS}, alt=alt, said=facts),
+            partial(FailedCase, **{name: row[name] for name in COLUMNS}, alt=alt, facts=facts),
         )
     order = {_file_of("cases", f"{matcher}-{query_id}"): at for at, (query_id, matcher) in enumerate(drawn)}
     found.listed["cases"].sort(key=lambda one: order[one.file])

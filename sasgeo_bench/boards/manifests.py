@@ -295,7 +295,7 @@ class PictureStrip(Picture):
 
 _OF_REJECTOR: Final = {"p_false_": "P(false)", "order_": "order"}
 _VERDICT: Final = "accepted_"
-_LEFT_OUT: Final = (_VERDICT, "told_hpl_")
+_LEFT_OUT: Final = (_VERDICT, "reported_hpl_")
 
 
 class FailedCase(PictureStrip):
@@ -304,17 +304,17 @@ class FailedCase(PictureStrip):
     query_id: str = ""
     failure: str = ""
     kind: str = ""
-    said: Mapping[str, str | float | int | bool | None] | None = None
+    facts: Mapping[str, str | float | int | bool | None] | None = None
 
     def lines(self) -> dict[str, str]:
         """Return the facts of a case for a page: a line for each rejector, without protection levels.
 
-        >>> said = {"error_m": 9, "p_false_own": 0.9, "accepted_own": "no", "told_hpl_gauss_0.01_m": 4}
-        >>> FailedCase(query_id="q", matcher="m", failure="aged", file="a.webp", said=said).lines()
+        >>> facts = {"error_m": 9, "p_false_own": 0.9, "accepted_own": "no", "reported_hpl_gauss_0.01_m": 4}
+        >>> FailedCase(query_id="q", matcher="m", failure="aged", file="a.webp", facts=facts).lines()
         {'error_m': '9', 'own': 'P(false) 0.9, withheld'}
         """
         found: dict[str, str] = {}
-        facts = self.said or {}
+        facts = self.facts or {}
         for name, value in facts.items():
             kind = next((kind for kind in _OF_REJECTOR if name.startswith(kind)), "")
             if kind:

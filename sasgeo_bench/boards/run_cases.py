@@ -87,7 +87,7 @@ def facts_of(case: Case) -> dict[str, float | str]:
 
     `error_m` is the distance from where the view was taken, also of absent places; `score_margin` the score of the
     first pose less that of the second; `p_false_<rejector>` (`order_<rejector>` where it is no probability) and
-    `accepted_<rejector>` are of a rejector, `told_<name>` are diagnostics of the answer.
+    `accepted_<rejector>` are of a rejector, `reported_<name>` are diagnostics of the answer.
     """
     prediction, truth = case.prediction, case.truth
     status: str = MISSING if prediction is None else prediction.status
@@ -109,7 +109,7 @@ def facts_of(case: Case) -> dict[str, float | str]:
         "changed_share": truth.changed_share,
         "alias_index": truth.alias_index,
         "map_age_years": truth.measured.get("age_years"),
-        **{f"told_{name}": value for name, value in (() if prediction is None else prediction.diagnostics.items())},
+        **{f"reported_{name}": value for name, value in (() if prediction is None else prediction.diagnostics.items())},
     }
     texts: dict[str, float | str] = {name: value for name, value in found.items() if isinstance(value, str)}
     numbers = {name: float(value) for name, value in found.items() if value is not None and name not in texts}

@@ -72,7 +72,7 @@ def trials():
         HEAD + b'a,"{""x"": 1}",64,-1,9,1\n',
     ],
 )
-def test_a_file_that_holds_no_trials_is_told_in_one_line(content, tmp_path, monkeypatch, capsys):
+def test_a_file_that_holds_no_trials_is_reported_in_one_line(content, tmp_path, monkeypatch, capsys):
     path = tmp_path / "trials.csv"
     if content is not None:
         path.write_bytes(content)

@@ -242,7 +242,7 @@ def test_a_folder_of_something_else_is_not_replaced(kept, tmp_path):
     ("name", "words"),
     [("pack.json", "holds no sound stored results"), ("truths.parquet", "truths.parquet differs")],
 )
-def test_damaged_results_are_told_in_a_line(kept, tmp_path, name, words, program):
+def test_damaged_results_are_reported_in_a_line(kept, tmp_path, name, words, program):
     board, plan, _, _ = kept
     pack_board(board, request_of(plan), tmp_path / "kept")
     (tmp_path / "kept" / name).write_bytes(b"{")

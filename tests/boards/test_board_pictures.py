@@ -131,14 +131,14 @@ def test_each_case_says_what_it_is_of_in_plain_numbers_and_words(made):
     cases = json.loads((folder / "pictures" / "pictures.json").read_text(encoding="utf-8"))["cases"]
     assert {"absent accepted", "aliased"} <= {one["failure"] for one in cases}
     for one in cases:
-        assert set(one) == {*("query_id", "matcher", "failure", "file", "suite", "region", "kind", "alt", "said")}
-        assert all(isinstance(value, str | float) for value in one["said"].values())
+        assert set(one) == {*("query_id", "matcher", "failure", "file", "suite", "region", "kind", "alt", "facts")}
+        assert all(isinstance(value, str | float) for value in one["facts"].values())
         row = board.scores["mine"].set_index("query_id").loc[one["query_id"]]
         assert (row["suite"], row["region"], row["kind"]) == (one["suite"], one["region"], one["kind"])
         assert bool(row["is_present"]) == (one["failure"] != "absent accepted")
     (wrong,) = [one for one in cases if one["failure"] != "absent accepted" and one["suite"] == "absent"][:1]
     error_m = board.scores["mine"].set_index("query_id").loc[wrong["query_id"], "position_error_m"]
-    assert wrong["said"].get("error_m", np.inf) == pytest.approx(error_m)
+    assert wrong["facts"].get("error_m", np.inf) == pytest.approx(error_m)
 
 
 def test_every_answer_has_its_place_and_every_failure_its_class(made):
@@ -253,7 +253,7 @@ def test_what_is_not_known_of_a_case_is_not_said(root):
     assert given["status"] == "missing"
     assert not {"error_m", "confidence", "score_margin"} & set(given)
     with_nan = Prediction(query_id=case.query.query_id, diagnostics={"odd": float("inf")})
-    assert "told_odd" not in facts_of(replace(case, prediction=with_nan))
+    assert "reported_odd" not in facts_of(replace(case, prediction=with_nan))
     assert facts_of(replace(case, prediction=with_nan))["status"] == "withheld"
 
 

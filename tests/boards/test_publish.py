@@ -441,7 +441,7 @@ def about(**changes):
         ("pictures/pictures.json", '{"cases": [{"file": "lost.png"}]}', "names 'lost.png', which is no picture"),
         ("pictures/pictures.json", '{"cases": [{"alt": "no file"}]}', "pictures.json is damaged"),
         ("pictures/pictures.json", "[" * 200_000, "pictures.json is damaged"),
-        ("pictures/pictures.json", '{"cases": [{"file": "a.png", "said": 5}]}', "cases.0.said is 5"),
+        ("pictures/pictures.json", '{"cases": [{"file": "a.png", "facts": 5}]}', "cases.0.facts is 5"),
         ("board.json", "[" * 200_000, "holds a damaged board (it is nested too deep"),
         ("board.json", about(pipeline=5), "pipeline is 5"),
         ("board.json", about(libraries=[]), "libraries is []"),

@@ -62,7 +62,7 @@ def test_a_stored_board_has_a_row_for_each_system_and_no_control(board, system, 
     assert cells[system][column].strip() != "-"
 
 
-def test_a_folder_that_is_no_board_is_told_in_one_line(tmp_path, capsys):
+def test_a_folder_that_is_no_board_is_reported_in_one_line(tmp_path, capsys):
     with pytest.raises(SystemExit):
         related_work.main([str(tmp_path)])
     assert f"{tmp_path} holds no board: score some runs first" in capsys.readouterr().err
@@ -137,7 +137,7 @@ def damaged(folder, table, change):
         ("leaderboard", lambda rows: pd.concat((rows, rows)), "leaderboard.parquet says one figure twice"),
     ],
 )
-def test_a_damaged_table_is_told_in_one_line(table, change, expected, tmp_path, capsys):
+def test_a_damaged_table_is_reported_in_one_line(table, change, expected, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         related_work.main([str(damaged(tmp_path / "board", table, change))])
     assert stop.value.code == 2

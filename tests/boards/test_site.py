@@ -221,7 +221,7 @@ def test_a_matcher_that_cannot_has_words_and_no_figure():
         ({"n": 0}, "not tested", "graph against raster", "no query"),
     ],
 )
-def test_a_contrast_is_told_in_words_with_figure_interval_p_and_counts(changes, outcome, headline, because):
+def test_a_contrast_is_reported_in_words_with_figure_interval_p_and_counts(changes, outcome, headline, because):
     (result,) = contrasts_of(source(findings=[replace(FINDING, **changes)]))
     assert (result.outcome, result.headline, result.because) == (outcome, headline, because)
     if result.outcome == "null":

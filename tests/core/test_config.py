@@ -53,7 +53,7 @@ def fault(text: str) -> str:
         ("name = ", "not valid TOML"),
     ],
 )
-def test_a_fault_is_told_in_plain_words(text, expected):
+def test_a_fault_is_reported_in_plain_words(text, expected):
     assert expected in fault(text)
 
 

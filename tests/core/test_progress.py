@@ -43,7 +43,7 @@ def die(number):
     return number
 
 
-def test_a_process_that_dies_is_told_in_one_line() -> None:
+def test_a_process_that_dies_is_reported_in_one_line() -> None:
     with pytest.raises(StoreError, match=r"one of 2 processes died.*ask for fewer --jobs"):
         list(spread(die, [1, 2], jobs=2))
 

@@ -280,7 +280,7 @@ def test_a_list_that_is_none_is_refused_in_a_line(url, tmp_path, folder, text):
         (("fetch", "memory://nobody/sent", "vaduz/region.json/here"), "region.json is a file"),
     ],
 )
-def test_mistakes_are_told_in_a_line(folder, mistake, monkeypatch, words, expected):
+def test_mistakes_are_reported_in_a_line(folder, mistake, monkeypatch, words, expected):
     monkeypatch.chdir(folder.parent)
     (folder / "empty").mkdir()
     (folder.parent / "odd").mkdir()

@@ -453,7 +453,7 @@ def test_a_hostile_board_is_scored_looked_at_published_and_released(root, printe
     printed(*score)
     board = root / "boards" / "mine"
     assert list((board / "figures").glob("*.svg"))
-    assert "told_=1+1" in (board / "pictures" / "pictures.json").read_text(encoding="utf-8")
+    assert "reported_=1+1" in (board / "pictures" / "pictures.json").read_text(encoding="utf-8")
     for name in ("leaderboard.csv", "protection.csv"):
         if (board / name).is_file():
             cells = [cell for row in csv.reader((board / name).open(encoding="utf-8", newline="")) for cell in row]

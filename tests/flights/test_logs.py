@@ -113,7 +113,9 @@ def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(written, mod
         ("d.csv", "lat,lon," + ",".join(f"c{at:0>99}" for at in range(99)), "'c000"),
     ],
 )  # fmt: skip
-def test_what_of_a_file_is_not_read_is_told_in_one_line(written: Callable, name: str, text: str, expected: str) -> None:
+def test_what_of_a_file_is_not_read_is_reported_in_one_line(
+    written: Callable, name: str, text: str, expected: str
+) -> None:
     if name == "d.csv":
         text += "".join(f"\n1,{at + 1}" + ",5" * 99 for at in range(2))
     last = read_log(

@@ -64,7 +64,7 @@ def test_impossible_values_are_refused(changes: dict[str, object], expected: str
         _straight(**changes)
 
 
-def test_a_quaternion_of_another_order_or_length_is_refused_and_times_since_1970_are_told_in_full() -> None:
+def test_a_quaternion_of_another_order_or_length_is_refused_and_times_since_1970_are_reported_in_full() -> None:
     with pytest.raises(FlightError, match="pose 1 has length 0, not 1: order is x y z w"):
         Trajectory(time_s=np.arange(2.0), position_m=np.zeros((2, 3)), quaternion_xyzw=np.zeros((2, 4)))
     turned = Rotation.from_rotvec([[0, 0, 0], [0, 0, np.pi / 2]]).as_quat()

@@ -307,7 +307,7 @@ def test_one_matcher_that_two_packages_name_alike_is_no_clash(install) -> None:
         ("mine:NoLicence", "wrong: card: licence is empty, say it in one line"),
     ],
 )
-def test_what_is_wrong_with_a_plugin_is_told_in_one_line(own, install, value, words) -> None:
+def test_what_is_wrong_with_a_plugin_is_reported_in_one_line(own, install, value, words) -> None:
     own(wrong=value, sound="mine:Sound")
     install(
         "z-broken",
@@ -363,7 +363,7 @@ def test_a_class_of_a_module_needs_no_entry_point(own) -> None:
         ("json:dumps", "cannot be made"),
     ],
 )
-def test_what_is_wrong_with_a_module_or_a_class_is_told_in_one_line(own, spec, words) -> None:
+def test_what_is_wrong_with_a_module_or_a_class_is_reported_in_one_line(own, spec, words) -> None:
     own()
     message = refusal(spec)
     assert message.startswith(f"{spec}: ")

@@ -159,7 +159,7 @@ def test_a_folder_that_is_not_empty_or_a_file_in_the_way_is_refused_and_left_alo
     assert [item for item in tmp_path.rglob("*") if item.is_file()] == [path]
 
 
-def test_a_file_above_the_folder_is_told_in_one_line(tmp_path) -> None:
+def test_a_file_above_the_folder_is_reported_in_one_line(tmp_path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(StoreError, match="cannot be written") as caught:
         write_plugin(tmp_path / "file" / "plugin", package_files("matcher", "my-matcher"))
@@ -188,7 +188,7 @@ def test_nothing_half_written_is_left_on_a_full_disk(tmp_path, monkeypatch, is_t
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_cannot_be_looked_into_is_told_in_one_line(tmp_path, monkeypatch) -> None:
+def test_a_folder_that_cannot_be_looked_into_is_reported_in_one_line(tmp_path, monkeypatch) -> None:
     def refuse(self):
         raise PermissionError(errno.EACCES, "Permission denied", str(self))
 

@@ -118,7 +118,7 @@ def test_a_full_history_is_cut_at_each_date(tmp_path):
         (["a.txt", "b-2014-01-01.osm"], [], "of no known format"),
     ],
 )
-def test_what_cannot_be_put_in_order_is_told_in_one_line(names, at, expected, tmp_path):
+def test_what_cannot_be_put_in_order_is_reported_in_one_line(names, at, expected, tmp_path):
     for name in names:
         if not name.startswith("none"):
             osm(tmp_path / name, (1, {"building": "yes"}, square(1, 1)))

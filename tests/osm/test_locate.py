@@ -65,7 +65,7 @@ def test_a_file_of_the_right_name_and_another_hash_is_passed_over(tmp_path):
     assert found.parent.name == "right"
 
 
-def test_what_is_not_found_is_told_in_one_line_with_hashes_and_folders(tmp_path, cache):
+def test_what_is_not_found_is_reported_in_one_line_with_hashes_and_folders(tmp_path, cache):
     put(tmp_path / "wrong", b"other")
     with pytest.raises(ExtractError) as caught:
         find_extract(wanted(), folders=[tmp_path / "wrong"])

@@ -268,7 +268,7 @@ def test_a_raster_of_another_size_than_the_manifest_says_is_refused(there):
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"schema_version": 1}', "[" * 100_000])
-def test_a_damaged_manifest_is_told_in_one_line(content, tmp_path):
+def test_a_damaged_manifest_is_reported_in_one_line(content, tmp_path):
     (tmp_path / "region.json").write_text(content)
     with pytest.raises(StoreError, match="build the region again") as caught:
         read_manifest(tmp_path)

@@ -76,7 +76,7 @@ def test_a_place_that_is_none_is_refused_with_the_mend(place, words):
         (text() + EXTRACT, "two extracts have the date 2020-01-01"),
     ],
 )
-def test_other_faults_are_told_in_one_line(content, words):
+def test_other_faults_are_reported_in_one_line(content, words):
     assert words in fault(content)
 
 

@@ -119,7 +119,7 @@ def test_chunks_of_a_run_give_up_a_matcher_that_hangs_together_and_another_run_d
         ("tcp://127.0.0.1:nine", "as tcp://host:port, got 'tcp://127.0.0.1:nine'"),
     ],
 )
-def test_a_cluster_that_is_not_there_is_told_in_one_line(task, tmp_path, monkeypatch, address, words):
+def test_a_cluster_that_is_not_there_is_reported_in_one_line(task, tmp_path, monkeypatch, address, words):
     monkeypatch.setattr(progress, "_CONNECT_S", 0.5)
     plan = plan_run(request_of(task, tmp_path, dask=address))
     with pytest.raises(ConfigError, match=words):

@@ -178,7 +178,7 @@ def test_only_runs_of_one_matcher_version_and_settings_are_merged(tmp_path, rows
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", "[" * 100_000, "\x00", '{"a": NaN}', '{"a": 1, "a": 2}'])
-def test_a_damaged_run_json_is_told_in_one_line(tmp_path, text):
+def test_a_damaged_run_json_is_reported_in_one_line(tmp_path, text):
     (tmp_path / RUN).write_text(text)
     line = refusal(RunManifest.open, tmp_path)
     assert "run.json is damaged (" in line
@@ -200,7 +200,7 @@ def test_what_a_run_does_not_state_is_not_written_and_what_nobody_knows_is_kept(
     assert (tmp_path / RUN).read_text() == text
 
 
-def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
+def test_a_folder_that_cannot_be_written_is_reported_in_one_line(tmp_path):
     (tmp_path / "file").write_text("mine")
     for folder in (tmp_path / "file", tmp_path / "file" / "deep"):
         assert f"{folder}/run.json cannot be written (" in refusal(RunManifest().save, folder)

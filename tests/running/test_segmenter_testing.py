@@ -78,7 +78,7 @@ def test_what_a_segmenter_may_do_is_no_fault(table, name) -> None:
         ("LooksBack", 5, "has another answer after others, in a fresh process"),
     ],
 )
-def test_a_fault_is_told_in_its_own_row(table, name, row, words) -> None:
+def test_a_fault_is_reported_in_its_own_row(table, name, row, words) -> None:
     rows = table(name)
     assert failed(rows)[0] == ROWS[row]
     assert words in rows[ROWS[row]].found
@@ -103,7 +103,7 @@ def test_a_segmenter_that_learns_has_two_rows_more(table) -> None:
         ("CannotWithout", UNTAUGHT, "learned = None: image 0: crash: TypeError"),
     ],
 )
-def test_a_fault_of_learning_is_told_in_its_own_row(table, name, row, words) -> None:
+def test_a_fault_of_learning_is_reported_in_its_own_row(table, name, row, words) -> None:
     rows = table(name)
     assert failed(rows) == [row]
     assert words in rows[row].found

@@ -101,7 +101,7 @@ def test_a_good_matcher_passes_every_row_and_may_write_to_its_scratch_folder(own
         ("BornWithChance", "the same answers in any order", "in a fresh process"),
     ],
 )
-def test_a_fault_is_told_in_its_own_row_and_in_no_other(table, name, row, words) -> None:
+def test_a_fault_is_reported_in_its_own_row_and_in_no_other(table, name, row, words) -> None:
     rows = table(name)
     assert failed(rows) == [row]
     assert words in rows[row].found
@@ -133,7 +133,7 @@ def test_a_matcher_that_learns_has_two_rows_more(table) -> None:
         ("CannotWithout", 1, "learned = None: crash: TypeError"),
     ],
 )
-def test_a_fault_of_learning_is_told_in_its_own_row(table, name, row, words) -> None:
+def test_a_fault_of_learning_is_reported_in_its_own_row(table, name, row, words) -> None:
     rows = table(name)
     assert failed(rows) == [LEARNT[row]]
     assert words in rows[LEARNT[row]].found

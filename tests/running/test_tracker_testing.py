@@ -84,7 +84,7 @@ def test_a_matcher_of_single_views_is_tried_as_it_follows(table) -> None:
         ("AlwaysSure", 13, "8 of 8 views accepted: odometry alone does not tell the place"),
     ],
 )
-def test_a_fault_is_told_in_its_own_row(table, name, row, words) -> None:
+def test_a_fault_is_reported_in_its_own_row(table, name, row, words) -> None:
     rows = table(f"straying:{name}")
     assert failed(rows)[0] == ROWS[row]
     assert words in rows[ROWS[row]].found

@@ -64,7 +64,7 @@ def test_losses_are_counted_over_what_was_flown_and_none_leaves_room_for_three()
         ("docs/results/countries", "flight-gap", "no flights of suite 'flight-gap': it has flight-real-age"),
     ],
 )
-def test_what_holds_no_such_flights_is_told_in_one_line_before_anything_is_printed(board, suite, fault, capsys):
+def test_what_holds_no_such_flights_is_reported_in_one_line_before_anything_is_printed(board, suite, fault, capsys):
     folder = Path(__file__).parents[2] / board
     with pytest.raises(SystemExit):
         PROGRAM["main"]([str(folder), "--suite", suite])

@@ -388,7 +388,7 @@ def test_one_query_of_a_kind_and_none_of_another_are_told_as_they_are():
     assert "answered_absent" not in set(board["metric"])  # no place was absent
 
 
-def test_one_of_something_is_told_in_the_singular():
+def test_one_of_something_is_reported_in_the_singular():
     board = leaderboard({"mine": scores([1.0], blocks=1, place="here", status="missing")}, draws=200)
     assert warnings_of(board)[0].startswith("1 block in 1 place: fewer than 36 in 12")
     assert warnings_of(board)[1] == "mine: 1 query lacks a row and counts as a miss."

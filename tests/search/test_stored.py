@@ -143,7 +143,7 @@ def test_what_is_cut_off_leaves_the_levels_as_they_were(tmp_path, whole):
         ("level-2.npy", lambda data: data.replace(b"order': False", b"order': True "), "expected uint8"),
     ],
 )  # fmt: skip
-def test_levels_whose_bytes_are_damaged_are_told_in_one_line(tmp_path, stored, name, spoil, words):
+def test_levels_whose_bytes_are_damaged_are_reported_in_one_line(tmp_path, stored, name, spoil, words):
     path = shutil.copytree(stored.folder, tmp_path / "map") / name
     path.write_bytes(spoil(path.read_bytes())) if spoil else path.unlink()
     with pytest.raises(StoreError, match=words) as caught:

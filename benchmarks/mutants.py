@@ -6,14 +6,20 @@
 
 A sample of all mutants that Cosmic Ray can make of some rooms is drawn by a seed. Each is put into a copy of the
 checkout and tried by the tests of its module, else by those of its room, up to the first that fails: first by those
-that run its line; by all if the line is run by an import, by a fixture that tests share, or in no test's own process.
+that run its line, or share a fixture that does; by all if the line is run by an import, or in no test's own process.
 One that keeps the processor for more than `LONGEST_S`, or hangs for ten times that, is found, too. Rows are written as
 they come, so that a run that was cut off goes on.
+
+    python benchmarks/mutants.py --into out/after.csv --like out/before.csv CHECKOUT
+
+tries the mutants of a table of another checkout instead, each at the line of the same text, and says how many outcomes
+differ: two samples of 400 show differences of 7 points, the same mutants twice those of 2.
 """
 
 import argparse
 import ast
 import csv
+import json
 import os
 import random
 import re
@@ -22,7 +28,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
@@ -54,19 +61,42 @@ class Mutant(NamedTuple):
     line: int
 
 
-def mutants_of(rooms: list[str]) -> Iterator[Mutant]:
-    """Yield every mutant of the modules of some rooms."""
+def mutants_of(rooms: list[str], root: Path = ROOT) -> Iterator[Mutant]:
+    """Yield every mutant of the modules of some rooms of a checkout."""
     from cosmic_ray.ast import ast_nodes, get_ast_from_path  # noqa: PLC0415 - on demand
     from cosmic_ray.plugins import get_operator, operator_names  # noqa: PLC0415
 
     operators = {name: get_operator(name) for name in sorted(operator_names()) if not _LEFT_OUT.search(name)}
     made = {name: operator() for name, operator in operators.items() if not operator.arguments()}
-    for path in sorted(path for room in rooms for path in (ROOT / "sasgeo_bench" / room).rglob("*.py")):
+    for path in sorted(path for room in rooms for path in (root / "sasgeo_bench" / room).rglob("*.py")):
         tree = get_ast_from_path(path)
         for name, operator in made.items():
             places = [start for node in ast_nodes(tree) for start, _ in operator.mutation_positions(node)]
             for occurrence, (line, _) in enumerate(places):
-                yield Mutant(path.relative_to(ROOT).as_posix(), name, occurrence, line)
+                yield Mutant(path.relative_to(root).as_posix(), name, occurrence, line)
+
+
+def found_again(mutants: Iterable[Mutant], others: Iterable[Mutant], theirs: Path) -> dict[Mutant, Mutant]:
+    """Return by mutant of another checkout that of ours at the only line of the same text, if there is one.
+
+    `mutants` are all of ours, and `others` all of theirs: of several in a line the places are counted.
+    """
+    ours = {key: mutant for key, mutant in _by_text(mutants, ROOT).items() if mutant is not None}
+    return {other: ours[key] for key, other in _by_text(others, theirs).items() if other is not None and key in ours}
+
+
+def _by_text(mutants: Iterable[Mutant], root: Path) -> dict[tuple[str, str, str, int], Mutant | None]:
+    """Return mutants by name of the module, operator, text of the line and number in it; None where two are alike."""
+    lines: dict[str, list[str]] = {}
+    number: Counter[tuple[str, str, int]] = Counter()
+    found: dict[tuple[str, str, str, int], Mutant | None] = {}
+    for mutant in mutants:
+        text = lines.setdefault(mutant.module, (root / mutant.module).read_text(encoding="utf-8").splitlines())
+        at = (mutant.module, mutant.operator, mutant.line)
+        key = (Path(mutant.module).name, mutant.operator, text[mutant.line - 1].strip(), number[at])
+        number[at] += 1
+        found[key] = None if key in found else mutant
+    return found
 
 
 def tests_of(module: str) -> list[str]:
@@ -86,10 +116,17 @@ def tests_of(module: str) -> list[str]:
 
 
 class Contexts:
-    """A plugin of pytest that tells coverage.py which test runs."""
+    """A plugin of pytest that tells coverage.py which test runs, and notes which tests share a fixture."""
 
     def __init__(self) -> None:
         self._test = ""
+        self.users: dict[str, list[str]] = {}
+
+    def pytest_collection_finish(self, session: pytest.Session) -> None:
+        """Note who uses a fixture, itself or through others."""
+        for item in session.items:
+            for name in getattr(item, "fixturenames", ()):
+                self.users.setdefault(f"fixture {name}", []).append(item.nodeid.partition("[")[0])
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
@@ -100,10 +137,10 @@ class Contexts:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: pytest.FixtureDef) -> Iterator[None]:
-        """Lay what more than one test uses to none of them."""
+        """Lay what more than one test uses to the fixture."""
         if fixturedef.scope == "function":
             return (yield)
-        _switch("")
+        _switch(f"fixture {fixturedef.argname}")
         try:
             return (yield)
         finally:
@@ -124,9 +161,11 @@ def trace(tests: list[str], into: Path) -> int:
 
     watched = Coverage(data_file=into, source=[str(Path.cwd() / "sasgeo_bench")], config_file=False)
     watched.start()
-    code = pytest.main([*_PYTEST, *tests], plugins=[Contexts()])
+    contexts = Contexts()
+    code = pytest.main([*_PYTEST, *tests], plugins=[contexts])
     watched.stop()
     watched.save()
+    into.with_suffix(".json").write_text(json.dumps(contexts.users), encoding="utf-8")
     return code
 
 
@@ -138,17 +177,18 @@ class Lines:
 
         self._data, self._copy = CoverageData(basename=str(data)), copy
         self._data.read()
+        self._users = json.loads(data.with_suffix(".json").read_text(encoding="utf-8"))
 
     def tests(self, mutant: Mutant) -> list[list[str]]:
         """Return the lists of tests that a mutant is tried by, in turn."""
         own = tests_of(mutant.module)
         run = self._data.contexts_by_lineno(str(self._copy / mutant.module))
         contexts = {each for line in _statement(self._copy / mutant.module, mutant.line) for each in run.get(line, [])}
+        users = {user for each in contexts for user in self._users.get(each, [each])}
         chosen = sorted(
-            (each for each in contexts if each and any(_is_within(each, test) for test in own)),
+            (each for each in users if each and any(_is_within(each, test) for test in own)),
             key=lambda each: next(number for number, test in enumerate(own) if _is_within(each, test)),
         )
-        # A test that was told to coverage.py twice, or a fixture that is the caller's own, costs nothing but time.
         return [chosen] if chosen and "" not in contexts else [*([chosen] if chosen else []), own]
 
 
@@ -219,43 +259,20 @@ def copied(folder: Path) -> Path:
     return folder
 
 
-def main() -> None:
-    """Try the mutants that are not in the table yet, and print the score of each room and of all."""
-    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
-    parser.add_argument("--into", type=Path, required=True, help="table (*.csv) to write, and to go on with")
-    parser.add_argument("--rooms", nargs="+", default=ROOMS, help="folders of sasgeo_bench")
-    parser.add_argument("--mutants", type=int, default=MUTANTS, help="how many of all are drawn")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--trace", nargs="+", metavar="TEST", help="run these under coverage.py into --into instead")
-    words = parser.parse_args()
-    if words.trace:
-        sys.exit(trace(words.trace, words.into))
-    every = list(mutants_of(words.rooms))
-    drawn = random.Random(words.seed).sample(every, words.mutants)  # noqa: S311 - a sample, no secret
-    known = _read(words.into)
-    left = [mutant for mutant in drawn if mutant not in known]
-    print(f"{len(every)} mutants, {len(drawn)} drawn, {len(left)} to be tried", file=sys.stderr, flush=True)
+def tried_all(mutants: list[Mutant], jobs: int) -> Iterator[tuple[Mutant, str]]:
+    """Yield each mutant with its outcome; ends the program if the tests fail without one."""
     copies: SimpleQueue[Path] = SimpleQueue()
-    with tempfile.TemporaryDirectory(prefix="mutants-") as scratch, ThreadPoolExecutor(words.jobs) as pool:
-        for number in range(words.jobs):
+    with tempfile.TemporaryDirectory(prefix="mutants-") as scratch, ThreadPoolExecutor(jobs) as pool:
+        for number in range(jobs):
             (Path(scratch) / str(number)).mkdir()
             copies.put(copied(Path(scratch) / str(number)))
-
-        every_test = list(dict.fromkeys(test for mutant in left for test in tests_of(mutant.module)))
         where = Path(scratch) / "0"
-        command = [
-            sys.executable,
-            str(Path(__file__).resolve()),
-            "--into",
-            str(where / "lines"),
-            "--trace",
-            *every_test,
-        ]
-        if left and subprocess.run(command, cwd=where, env=_environment(where), check=False).returncode:  # noqa: S603
+        every = list(dict.fromkeys(test for mutant in mutants for test in tests_of(mutant.module)))
+        command = [sys.executable, str(Path(__file__).resolve()), "--into", str(where / "lines"), "--trace", *every]
+        if subprocess.run(command, cwd=where, env=_environment(where), check=False).returncode:  # noqa: S603 - ours
             sys.exit("these tests fail without a mutant, so they tell nothing of one")
-        lines = Lines(where / "lines", where) if left else None
-        tests = {mutant: lines.tests(mutant) for mutant in left} if lines else {}
+        lines = Lines(where / "lines", where)
+        tests = {mutant: lines.tests(mutant) for mutant in mutants}
 
         def one(mutant: Mutant) -> tuple[Mutant, str]:
             copy = copies.get()
@@ -264,15 +281,48 @@ def main() -> None:
             finally:
                 copies.put(copy)
 
-        for mutant, outcome in pool.map(one, left):
-            known[mutant] = outcome
-            with words.into.open("a", newline="", encoding="utf-8") as file:
-                csv.writer(file).writerow([*mutant, outcome])
+        yield from pool.map(one, mutants)
+
+
+def main() -> None:
+    """Try the mutants that are not in the table yet, and print the score of each room and of all."""
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    parser.add_argument("--into", type=Path, required=True, help="table (*.csv) to write, and to go on with")
+    parser.add_argument("--rooms", nargs="+", default=ROOMS, help="folders of sasgeo_bench")
+    parser.add_argument("--mutants", type=int, default=MUTANTS, help="how many of all are drawn")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--like", nargs=2, type=Path, metavar=("TABLE", "CHECKOUT"), help="try the mutants of these")
+    parser.add_argument("--trace", nargs="+", metavar="TEST", help="run these under coverage.py into --into instead")
+    words = parser.parse_args()
+    if words.trace:
+        sys.exit(trace(words.trace, words.into))
+    every = list(mutants_of(words.rooms))
+    drawn = random.Random(words.seed).sample(every, words.mutants)  # noqa: S311 - a sample, no secret
+    pairs: dict[Mutant, Mutant] = {}
+    if words.like:
+        table, theirs = words.like
+        before = _read(table)
+        again = found_again(every, mutants_of(words.rooms, theirs), theirs)
+        pairs = {again[mutant]: mutant for mutant, outcome in before.items() if mutant in again and outcome != "none"}
+        drawn = list(pairs)
+        print(f"{len(drawn)} of {len(before)} mutants are found again", file=sys.stderr, flush=True)
+    known = _read(words.into)
+    left = [mutant for mutant in drawn if mutant not in known]
+    print(f"{len(every)} mutants, {len(drawn)} drawn, {len(left)} to be tried", file=sys.stderr, flush=True)
+    for mutant, outcome in tried_all(left, words.jobs) if left else ():
+        known[mutant] = outcome
+        with words.into.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerow([*mutant, outcome])
     for room in (*words.rooms, ""):
         outcomes = [known[each] for each in drawn if each.module.startswith(f"sasgeo_bench/{room}")]
         tested = [each for each in outcomes if each != "none"]
         score = wilson(sum(each != "left" for each in tested), len(tested))
         print(f"{room or 'all':>8}: {score.value:.3f} [{score.lo:.3f} {score.hi:.3f}] of {len(tested)}")
+    if pairs:
+        both = [(before[pairs[mutant]] != "left", known[mutant] != "left") for mutant in drawn]
+        gained, lost = both.count((False, True)), both.count((True, False))
+        print(f"found there alone: {lost}, here alone: {gained}, of {len(both)}")
 
 
 def _read(table: Path) -> dict[Mutant, str]:

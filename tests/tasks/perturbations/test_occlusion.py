@@ -141,9 +141,6 @@ def test_false_unknowns_lie_together_and_differ_between_classes():
         (np.ones((2, 2), dtype=bool), "bool of shape (2, 2)"),
         ([True], "list"),
     ],
-    (np.ones((3, 3)), "float64 of shape (3, 3)"),
-    (np.ones((2, 2), dtype=bool), "bool of shape (2, 2)"),
-    ([True], "list"),
 )
 def test_what_is_no_mask_of_the_view_is_refused_in_one_line(mask, what):
     view = Evidence(classes=("water",), cells=np.zeros((1, 3, 3), dtype=np.uint8), cell_size_m=1.0)

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build regions: the function and its command."""
 
-from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, TypeVar, cast
 
 import typer
 
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.core.progress import reported, spread
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, named
+from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.regions import build
-from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 
@@ -21,14 +23,20 @@ if TYPE_CHECKING:
     from sasgeo_bench.sensing.rendering.palettes import Family
     from sasgeo_bench.sensing.rendering.seasons import Season
 
+Item = TypeVar("Item", RegionFile, build.BuildPlan)
+Result = TypeVar("Result")
+
 
 @dataclass(frozen=True, kw_only=True)
 class BuildOptions(Options):
     """Flags of build-region."""
 
-    region: Annotated[list[str], typer.Argument(help="ids from list regions, or files of your own (*.toml)")] = field(
-        kw_only=False
+    region: Annotated[list[str] | None, typer.Argument(help="ids from list regions, or files of your own (*.toml)")] = (
+        field(default=None, kw_only=False)
     )
+    every: Annotated[
+        bool, typer.Option("--every", help="all regions of --region-files, or without it all real places that ship")
+    ] = False
     date: Annotated[str | None, typer.Option(help="YYYY-MM-DD of one of the region's extracts; default: newest")] = None
     extracts: ExtractFolders = None
     imagery: ImageryFolders = None
@@ -43,7 +51,7 @@ class BuildOptions(Options):
 def build_region(options: BuildOptions) -> tuple[Path, ...]:
     """Build regions from dated extracts: layers, features, graph, imagery if there is any, manifest and preview.
 
-    A region that is up to date is not built again.
+    A region that is up to date is not built again. Of `every` region one that cannot be built costs no other.
 
     Returns
     -------
@@ -53,7 +61,8 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
     Raises
     ------
     ConfigError
-        If there is no such region, or none of that date.
+        If no region is named, there is no such one, or none of that date; once all others are built, if some of `every`
+        region could not be.
     ExtractError
         If an extract is not on this machine and cannot be downloaded.
     ImageryError
@@ -66,24 +75,118 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
     >>> [folder.as_posix() for folder in folders]
     ['out/regions/town-grid@2019-01-01', 'out/regions/town-suburb@2019-01-01']
     """
-    specs = [read_region_file(find_region_file(name, folders=options.region_files or ())) for name in options.region]
-    plans = [
-        build.plan_build(
-            spec,
-            out=options.out,
-            date=read_date(options.date),
-            extract_folders=options.extracts or (),
-            imagery_folders=options.imagery or (),
-            with_preview=True,
-        )
-        for spec in specs
-    ]
+    specs = _wanted(options)
+    plan = partial(
+        build.plan_build,
+        out=options.out,
+        date=read_date(options.date),
+        extract_folders=options.extracts or (),
+        imagery_folders=options.imagery or (),
+        with_preview=True,
+    )
+    if not options.every:
+        plans = [plan(spec) for spec in specs]
+    else:
+        plans = [one for one in (_attempt(spec, plan) for spec in specs) if one is not None]
     if options.dry_run:
         options.say("\n".join(plan.to_text() for plan in plans))
-    else:
-        built = spread(reported(build.build_region), plans, jobs=options.jobs, dask=options.dask, label="regions built")
-        deque(built, maxlen=0)
+        return tuple(plan.folder for plan in plans)
+    built = spread(
+        reported(_build if options.every else build.build_region),
+        plans,
+        jobs=options.jobs,
+        dask=options.dask,
+        label="regions built",
+    )
+    done = {plan.spec.id for plan, found in zip(plans, built, strict=True) if found is not None}
+    failed = [spec.id for spec in specs if spec.id not in done]
+    if failed:
+        raise ConfigError(f"not built: {named(failed, 'region')} of {len(specs)}; the lines above say why")
     return tuple(plan.folder for plan in plans)
+
+
+def _build(plan: build.BuildPlan) -> Manifest | None:
+    return _attempt(plan, build.build_region)
+
+
+def _attempt(item: Item, work: Callable[[Item], Result]) -> Result | None:
+    """Do what one region needs; if that fails, a line says why, and the others are done."""
+    try:
+        return work(item)
+    except SasgeoError as error:
+        tell(f"{item.spec.id if isinstance(item, build.BuildPlan) else item.id}: not built: {error}")
+        return None
+
+
+def _wanted(options: BuildOptions) -> list[RegionFile]:
+    """Return the regions to build; every real one has an extract with a hash."""
+    folders = options.region_files or ()
+    if bool(options.region) == options.every:
+        raise ConfigError("name regions to build, or build --every region, not both: list regions shows them")
+    if not options.every:
+        return [read_region_file(find_region_file(name, folders=folders)) for name in options.region or ()]
+    found = [read_region_file(path) for path in list_region_files(folders=folders).values()]
+    own = {path.stem for folder in folders for path in folder.glob("*.toml")}
+    return [spec for spec in found if (spec.id in own if own else spec.extract[0].town is None)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProposeOptions(Options):
+    """Flags of propose-regions."""
+
+    manifest: Annotated[Path, typer.Argument(help="list of extracts (*.toml): file, place, country, what, date")] = (
+        field(kw_only=False)
+    )
+    into: Annotated[Path, typer.Option(help="folder to write region files into")] = Path("my-regions")
+    extracts: ExtractFolders = None
+    jobs: Annotated[int, typer.Option(min=1, help="places read at once")] = 1
+
+
+@takes(ProposeOptions)
+def propose_regions(options: ProposeOptions) -> tuple[Path, ...]:
+    """Write region files for the extracts of a manifest: one to three windows for each place, where it is built.
+
+    A file that is there already stays as it is; a place whose extracts have regions in the package is left out.
+
+    Returns
+    -------
+    tuple of Path
+        The region files of the manifest, those that were there among them.
+
+    Raises
+    ------
+    ConfigError
+        If the manifest cannot be read, or lacks a key.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> sgb.propose_regions("nowhere.toml")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.core.errors.ConfigError: nowhere.toml cannot be read: name a manifest of extracts (*.toml)
+    """
+    from sasgeo_bench.regions.proposing import propose_regions as proposed  # noqa: PLC0415 - build-region needs none
+
+    known = [read_region_file(path) for path in list_region_files().values()]
+    found = []
+    for name, text in proposed(options.manifest, folders=options.extracts or (), known=known, jobs=options.jobs):
+        path = options.into / f"{name}.toml"
+        found.append(path)
+        if path.exists():
+            if path.read_text(encoding="utf-8") != text:
+                options.say(f"{path}: kept, although the manifest gives another: remove it to have that")
+            continue
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        options.say(path)
+    return tuple(found)
+
+
+def propose_regions_command(options: ProposeOptions) -> None:
+    """Write region files for the extracts of a manifest: one to three windows for each place, where it is built."""
+    with shown_progress():
+        propose_regions(**vars(options) | {"say": say})
 
 
 @dataclass(frozen=True, kw_only=True)

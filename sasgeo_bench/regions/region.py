@@ -47,6 +47,13 @@ class Provenance(Record):
     surveyed_by: Annotated[
         Line | None, Field(title="surveyed by", description="Who surveyed the place, as its region file says")
     ] = None
+    country: Annotated[
+        Line | None, Field(title="country", description="Country or territory that the place lies in")
+    ] = None
+    dated_by: Annotated[Line | None, Field(title="dated by", description="How the date of the extract is known")] = None
+    source: Annotated[
+        Line | None, Field(title="source", description="Where an extract without an address to load it from comes from")
+    ] = None
 
     def titled(self) -> dict[str, str]:
         """Return what is stated, by the titles of the lines."""

@@ -1,0 +1,364 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Region files for the extracts of a manifest: one to three windows for each place, where it is built."""
+
+import datetime as dt
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import geopandas as gpd
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from sasgeo_bench.core.config import Document, Line, parse_toml
+from sasgeo_bench.core.errors import ConfigError, SasgeoError
+from sasgeo_bench.core.folders import sha256_of
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.progress import reported, spread, tell
+from sasgeo_bench.geometry.grid import utm_epsg
+from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
+from sasgeo_bench.osm.locate import Extract, PlainName, Sha256, find_extract
+from sasgeo_bench.osm.read import Reading, read_extract
+from sasgeo_bench.osm.scan import scan_file
+from sasgeo_bench.osm.snapshot import open_snapshot
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.region_spec import Identifier, RegionFile
+
+STEP_M: Final = 128.0  # of the lattice on which windows lie
+SHORTEST_M: Final = 1536.0  # of a side of a window
+LONGEST_M: Final = 4096.0
+MOST_KM2: Final = 16.0
+MOST_WINDOWS: Final = 3  # of a place
+LEAST_BUILT_KM2: Final = 2.0  # in a second or third window
+_WORTH: Final = 0.15  # a window grows where this share of what it gains is built
+_REACH_M: Final = 60_000.0  # from the middle of the buildings: what lies farther away is a stray object
+_WORLD: Final = (-180.0, -90.0, 180.0, 90.0)
+_ADDRESS: Final = re.compile(r"https?://\S+")
+
+Cells = NDArray[np.int64]
+
+
+class ListedExtract(Document):
+    """One `[[extract]]` of a manifest; keys that are not read here are its owner's.
+
+    Without `sha256` the file is taken as it lies there. `source` says where it comes from: an address is one to
+    download it from where `source_sha256` is the hash of what lies there; any other text is stated and no more.
+    """
+
+    model_config = ConfigDict(extra="ignore", strict=False)
+
+    file: PlainName
+    place: Identifier
+    country: Line
+    what: Line
+    date: dt.date
+    date_known_by: Line | None = None
+    sha256: Sha256 | None = None
+    source: Line | None = None
+    source_sha256: Sha256 | None = None
+
+
+class ExtractManifest(Document):
+    """A list of dated extracts of places."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    extract: Annotated[list[ListedExtract], Field(min_length=1)]
+
+    def places(self) -> dict[str, list[ListedExtract]]:
+        """Return the extracts of each place by date; raise `ConfigError` if two are of one day, or of two countries."""
+        found: dict[str, list[ListedExtract]] = {}
+        for item in sorted(self.extract, key=lambda one: one.date):
+            found.setdefault(item.place, []).append(item)
+        for place, items in found.items():
+            dates, countries = [item.date for item in items], {item.country for item in items}
+            if len(set(dates)) < len(dates):
+                raise ConfigError(f"{place}: two extracts are of one day: keep one of them")
+            if len(countries) > 1:
+                raise ConfigError(f"{place} lies in {' and in '.join(sorted(countries))}: give each its own name")
+        return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Window:
+    """A rectangle on the lattice of a UTM zone, from its south-western corner; `built` steps have a house."""
+
+    epsg: int
+    col: int
+    row: int
+    cols: int
+    rows: int
+    built: int
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Return width and height, metres."""
+        return (self.cols * STEP_M, self.rows * STEP_M)
+
+    @property
+    def center_lonlat(self) -> tuple[float, float]:
+        """Return longitude and latitude of the middle, degrees to 1 m."""
+        width_m, height_m = self.size_m
+        lon, lat = to_lonlat(self.epsg).transform(self.col * STEP_M + width_m / 2, self.row * STEP_M + height_m / 2)
+        return (round(lon, 5), round(lat, 5))
+
+    @property
+    def built_km2(self) -> float:
+        """Return the ground of the steps with a house, km2."""
+        return self.built * STEP_M**2 / 1e6
+
+
+def find_windows(houses_lonlat: NDArray[np.float64], *, most: int = MOST_WINDOWS) -> list[Window]:
+    """Return the windows of a place in which most is built, the best first; none without a house.
+
+    Parameters
+    ----------
+    houses_lonlat : ndarray of float, shape (N, 2)
+        A point of each building, degrees.
+    most : int
+        How many windows there are at most; the second and all others have `LEAST_BUILT_KM2` of their own.
+
+    Notes
+    -----
+    A step of the lattice is built if a building lies in it. If all of them fit into one window, it is that; else each
+    window is the one with the largest count of built steps less 15 % of all its steps, so that it grows into what is
+    built. Windows do not overlap. Houses farther than 60 km from their median are left out.
+
+    Examples
+    --------
+    >>> east, north = np.meshgrid(np.arange(9.50, 9.53, 0.001), np.arange(47.10, 47.12, 0.001))
+    >>> (town,) = find_windows(np.column_stack([east.ravel(), north.ravel()]))
+    >>> town.size_m, town.built_km2 > 3
+    ((2304.0, 2176.0), True)
+    """
+    if not len(houses_lonlat):
+        return []
+    middle = np.median(houses_lonlat, axis=0)
+    epsg = utm_epsg(*map(float, middle))
+    to_grid = from_lonlat(epsg)
+    points_m = np.column_stack(to_grid.transform(houses_lonlat[:, 0], houses_lonlat[:, 1]))
+    near = np.abs(points_m - np.array(to_grid.transform(*middle))).max(axis=1) < _REACH_M
+    steps = np.unique(np.floor(points_m[near] / STEP_M).astype(np.int64), axis=0)
+    low, high = int(SHORTEST_M / STEP_M), int(LONGEST_M / STEP_M)
+    first, extent = steps.min(axis=0), np.ptp(steps, axis=0) + 1
+    if extent.max() <= high and extent.prod() * STEP_M**2 <= MOST_KM2 * 1e6:
+        sides = np.maximum(extent, low)
+        col, row = (first - (sides - extent) // 2).tolist()
+        return [Window(epsg=epsg, col=col, row=row, cols=int(sides[0]), rows=int(sides[1]), built=len(steps))]
+    corner = first - high
+    built = np.zeros(tuple((extent + 2 * high)[::-1]), dtype=bool)
+    built[steps[:, 1] - corner[1], steps[:, 0] - corner[0]] = True
+    found: list[Window] = []
+    is_taken = np.zeros_like(built)
+    while len(found) < most:
+        row, col, rows, cols = _best(np.where(is_taken, -float(built.size), built - _WORTH), low, high)
+        chosen = (slice(row, row + rows), slice(col, col + cols))
+        window = Window(
+            epsg=epsg,
+            col=col + int(corner[0]),
+            row=row + int(corner[1]),
+            cols=cols,
+            rows=rows,
+            built=int(built[chosen].sum()),
+        )
+        if found and window.built_km2 < LEAST_BUILT_KM2:
+            break
+        found.append(window)
+        is_taken[chosen], built[chosen] = True, False
+    return found
+
+
+def _best(gain: NDArray[np.float64], low: int, high: int) -> tuple[int, int, int, int]:
+    """Return row, column, rows and columns of the window with the largest sum."""
+    sums = np.zeros((gain.shape[0] + 1, gain.shape[1] + 1))
+    sums[1:, 1:] = gain.cumsum(axis=0).cumsum(axis=1)
+    best, found = -np.inf, (0, 0, low, low)
+    for rows in range(low, high + 1):
+        strips = sums[rows:] - sums[:-rows]
+        for cols in range(low, min(high, int(MOST_KM2 * 1e6 / STEP_M**2) // rows) + 1):
+            totals = strips[:, cols:] - strips[:, :-cols]
+            at = int(totals.argmax())
+            if totals.flat[at] > best:
+                row, col = divmod(at, totals.shape[1])
+                best, found = float(totals.flat[at]), (row, col, rows, cols)
+    return found
+
+
+URBAN: Final = 0.15  # share of the mapped ground under buildings
+SUBURBAN: Final = 0.03
+INDUSTRIAL: Final = 0.4  # share of that under buildings of 1500 m2 and more
+_LARGE_M2: Final = 1500.0
+FIELDS: Final = 0.15  # share of the mapped ground
+WATER: Final = 0.02
+
+
+def scenes_of(features: gpd.GeoDataFrame, ground: shapely.Geometry) -> list[str]:
+    """Return the kinds of ground of a region, measured on what is mapped of it.
+
+    Parameters
+    ----------
+    features : GeoDataFrame
+        Those of a `Reading`, in metres.
+    ground : shapely.Geometry
+        The mapped part of the region.
+
+    Examples
+    --------
+    >>> squares = [shapely.box(0, 0, 40, 40), shapely.box(60, 0, 100, 100)]
+    >>> features = gpd.GeoDataFrame({"class": ["building", "farmland"]}, geometry=squares)
+    >>> scenes_of(features.assign(osm_type="way"), shapely.box(0, 0, 100, 100))
+    ['urban', 'industrial', 'agricultural']
+    """
+    names, shapes = features["class"].to_numpy(str), features.geometry.to_numpy()
+    is_area = np.isin(shapely.get_type_id(shapes), (3, 6))
+
+    def share(name: str) -> float:
+        return float(shapely.area(shapely.intersection(shapes[is_area & (names == name)], ground)).sum() / ground.area)
+
+    houses_m2 = shapely.area(shapes[is_area & (names == "building")])
+    built, large = share("building"), houses_m2[houses_m2 >= _LARGE_M2].sum() / max(houses_m2.sum(), 1.0)
+    is_coast = bool((features["osm_type"] == "coastline").any())
+    found = {
+        "urban": built >= URBAN,
+        "suburban": SUBURBAN <= built < URBAN,
+        "industrial": built >= SUBURBAN and large >= INDUSTRIAL,
+        "riverside": share("water") >= WATER and not is_coast,
+        "coastal": is_coast,
+        "agricultural": share("farmland") >= FIELDS,
+    }
+    return [name for name, is_there in found.items() if is_there] or ["suburban"]
+
+
+def propose_regions(
+    manifest: Path, *, folders: Sequence[Path] = (), known: Iterable[RegionFile] = (), jobs: int = 1
+) -> Iterator[tuple[str, str]]:
+    """Yield id and text of a region file for each window of each place of a manifest.
+
+    Files are looked for as `build_region` does, in `folders` and beside the manifest first. A place with an extract
+    that a region of `known` names already is left out, and so is one whose newest extract cannot be read, or has no
+    building: a line says which. Raise `ConfigError` if the manifest is wrong.
+    """
+    try:
+        text = plain_file(manifest).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{manifest} cannot be read: name a manifest of extracts (*.toml)") from error
+    places = parse_toml(text, ExtractManifest, source=str(manifest)).places()
+    named = {extract.file for spec in known for extract in spec.extract}
+    jobs_of = []
+    for place, listed in places.items():
+        if any(item.file in named for item in listed):
+            tell(f"{place}: has regions already")
+        else:
+            jobs_of.append(_Place(name=place, listed=tuple(listed), folders=(*folders, manifest.parent)))
+    for found in spread(reported(_proposed), jobs_of, jobs=jobs, label="places read"):
+        yield from found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Place:
+    name: str
+    listed: tuple[ListedExtract, ...]
+    folders: tuple[Path, ...]
+
+
+def _proposed(place: _Place) -> list[tuple[str, str]]:
+    """Return id and text of each region of a place; none, and a line, if that cannot be."""
+    try:
+        extracts = [_extract(item, place.folders) for item in place.listed]
+        path = find_extract(extracts[-1], folders=place.folders)
+        windows = find_windows(_houses(path, place.listed[-1].date))
+        found = []
+        for number, window in enumerate(windows, start=1):
+            name = place.name if number == 1 else f"{place.name}-{number}"
+            reading = _reading(path, name, window, place.listed[-1].date)
+            scenes = scenes_of(reading.features, reading.coverage)
+            found.append((name, _text(name, number, place.listed, extracts, window, scenes)))
+    except SasgeoError as error:
+        tell(f"{place.name}: left out: {error}")
+        return []
+    if not found:
+        tell(f"{place.name}: left out: {path.name} has no building")
+    return found
+
+
+def _extract(item: ListedExtract, folders: Sequence[Path]) -> Extract:
+    """Return the extract of a region file; the file itself gives a hash that is missing."""
+    path = next((folder / item.file for folder in folders if (folder / item.file).is_file()), None)
+    if item.sha256 is None and path is None:
+        raise ConfigError(f"{item.file} has no sha256, and is in none of the folders: add one, or put the file there")
+    first = item.sha256 or sha256_of(path or Path(item.file))
+    if item.source is None or item.source_sha256 is None or not _ADDRESS.fullmatch(item.source):
+        return Extract(file=item.file, date=item.date, sha256=(first,))
+    return Extract(
+        file=item.file,
+        date=item.date,
+        sha256=tuple(dict.fromkeys([first, item.source_sha256])),
+        urls=(item.source,),
+    )
+
+
+def _houses(path: Path, date: dt.date) -> NDArray[np.float64]:
+    """Return a point of each building of an extract, longitude and latitude."""
+    with open_snapshot(path, at=date) as snapshot:
+        scan = scan_file(snapshot.path, load_taxonomy(), box=_WORLD)
+    wanted = [any(label.class_name == "building" for label in traits.labels) for traits in scan.traits]
+    shapes = shapely.from_wkb([row.wkb for row in scan.rows if wanted[row.kind]])
+    points: NDArray[np.float64] = shapely.get_coordinates(shapely.centroid(shapes))
+    return points
+
+
+def _reading(path: Path, name: str, window: Window, date: dt.date) -> Reading:
+    spec = RegionFile.model_validate(
+        {
+            "id": name,
+            "title": name,
+            "scenes": ["urban"],
+            "center_lonlat": window.center_lonlat,
+            "size_m": window.size_m,
+            "cell_size_m": 1.0,
+            "extract": [Extract(file=path.name, date=date, sha256=("0" * 64,))],
+        }
+    )
+    return read_extract(path, spec.grid(), at=date)
+
+
+def _text(
+    name: str,
+    number: int,
+    listed: Sequence[ListedExtract],
+    extracts: Sequence[Extract],
+    window: Window,
+    scenes: Iterable[str],
+) -> str:
+    newest = listed[-1]
+    titled = newest.place.replace("-", " ").title() + (f" {number}" if number > 1 else "")
+    width_m, height_m = window.size_m
+    origin = newest.source if newest.source and not extracts[-1].urls else None
+    lines = [
+        "# Extract (c) OpenStreetMap contributors, ODbL 1.0.",
+        f"id = {_quoted(name)}",
+        f"title = {_quoted(f'{titled}, {newest.country}: {newest.what}')}",
+        f"scenes = [{', '.join(map(_quoted, scenes))}]",
+        f"center_lonlat = [{', '.join(map(str, window.center_lonlat))}]",
+        f"size_m = [{width_m:.0f}, {height_m:.0f}]",
+        "cell_size_m = 1.0",
+        "",
+        "[provenance]",
+        f"country = {_quoted(newest.country)}",
+        *([f"dated_by = {_quoted(newest.date_known_by)}"] if newest.date_known_by else []),
+        *([f"source = {_quoted(origin)}"] if origin else []),
+    ]
+    for extract in extracts:
+        hashes = "".join(f"  {_quoted(each)},\n" for each in extract.sha256)
+        lines += ["", "[[extract]]", f"file = {_quoted(extract.file)}", f"date = {extract.date.isoformat()}"]
+        lines += [f"sha256 = [\n{hashes}]", *([f"urls = [{_quoted(extract.urls[0])}]"] if extract.urls else [])]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)

@@ -239,19 +239,19 @@ def propose_regions(
 ) -> Iterator[tuple[str, str]]:
     """Yield id and text of a region file for each window of each place of a manifest.
 
-    Files are looked for as `build_region` does, in `folders` and beside the manifest first. A place with an extract
-    that a region of `known` names already is left out, and so is one whose newest extract cannot be read, or has no
-    building: a line says which. Raise `ConfigError` if the manifest is wrong.
+    Files are looked for as `build_region` does, in `folders` and beside the manifest first. A place is left out if a
+    region of `known` has its name or one of its extracts, or if its newest extract cannot be read, or has no building:
+    a line says which. Raise `ConfigError` if the manifest is wrong.
     """
     try:
         text = plain_file(manifest).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{manifest} cannot be read: name a manifest of extracts (*.toml)") from error
     places = parse_toml(text, ExtractManifest, source=str(manifest)).places()
-    named = {extract.file for spec in known for extract in spec.extract}
+    taken = {name for spec in known for name in (spec.id, *(extract.file for extract in spec.extract))}
     jobs_of = []
     for place, listed in places.items():
-        if any(item.file in named for item in listed):
+        if not taken.isdisjoint({place, *(item.file for item in listed)}):
             tell(f"{place}: has regions already")
         else:
             jobs_of.append(_Place(name=place, listed=tuple(listed), folders=(*folders, manifest.parent)))

@@ -155,13 +155,13 @@ def test_a_place_that_cannot_be_read_is_left_out_with_a_line(towns, manifest):
 
 
 def test_a_place_of_a_known_region_is_left_out(towns, manifest):
-    listed = manifest(row(MILL, "mill"))
-    ((_, text),) = propose_regions(listed, folders=[towns])
+    ((_, text),) = propose_regions(manifest(row(MILL, "mill")), folders=[towns])
     known = proposing.parse_toml(text, proposing.RegionFile, source="mill")
     lines = []
     with reporting(lines.append):
-        assert list(propose_regions(listed, folders=[towns], known=[known])) == []
-    assert lines == ["mill: has regions already"]
+        for again in (row(MILL, "mill"), row(SECOND, "mill"), row(MILL, "other")):
+            assert list(propose_regions(manifest(again), folders=[towns], known=[known])) == []
+    assert lines == ["mill: has regions already"] * 2 + ["other: has regions already"]
 
 
 @pytest.mark.parametrize(

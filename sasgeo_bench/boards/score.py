@@ -86,8 +86,7 @@ def score_board(request: ScoreRequest) -> Scored:
     rules, metrics = rules_of(request.rejectors, request.split), find_metrics(request.metrics)
     failures = Failures(log_beside(request.board), is_reported=False)  # reported with the board, or raised
     ranks = None
-    # Entries are compared together. If that fails because of some of them, these are noted as failed, and not loaded
-    # again.
+    # Entries are compared together: those that this fails for are noted as failed, and not loaded again.
     while ranks is None:
         loaded = _scored_entries(request, failures)
         controls = evaluate_controls(loaded.scores)

@@ -30,7 +30,8 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region_spec import Identifier, RegionFile
 
 STEP_M: Final = 128.0  # of the lattice on which windows lie
-SHORTEST_M: Final = 1536.0  # of a side of a window
+SHORTEST_M: Final = 1536.0  # side of one of several windows of a place
+LEAST_M: Final = 768.0  # side of the only one
 LONGEST_M: Final = 4096.0
 MOST_KM2: Final = 16.0
 MOST_WINDOWS: Final = 3  # of a place
@@ -125,8 +126,8 @@ def find_windows(houses_lonlat: NDArray[np.float64], *, most: int = MOST_WINDOWS
 
     Notes
     -----
-    A step of the lattice is built if a building lies in it. If all of them fit into one window, it is that; else each
-    window is the one with the largest count of built steps less 15 % of all its steps, so that it grows into what is
+    A step of the lattice is built if a building lies in it. If all of them fit into one window, it is that, with a step
+    around; else each window is the one with the largest count of built steps less 15 % of all its steps, so that it grows into what is
     built. Windows do not overlap. Houses farther than 60 km from their median are left out.
 
     Examples
@@ -134,7 +135,7 @@ def find_windows(houses_lonlat: NDArray[np.float64], *, most: int = MOST_WINDOWS
     >>> east, north = np.meshgrid(np.arange(9.50, 9.53, 0.001), np.arange(47.10, 47.12, 0.001))
     >>> (town,) = find_windows(np.column_stack([east.ravel(), north.ravel()]))
     >>> town.size_m, town.built_km2 > 3
-    ((2304.0, 2176.0), True)
+    ((2560.0, 2432.0), True)
     """
     if not len(houses_lonlat):
         return []
@@ -147,7 +148,7 @@ def find_windows(houses_lonlat: NDArray[np.float64], *, most: int = MOST_WINDOWS
     low, high = int(SHORTEST_M / STEP_M), int(LONGEST_M / STEP_M)
     first, extent = steps.min(axis=0), np.ptp(steps, axis=0) + 1
     if extent.max() <= high and extent.prod() * STEP_M**2 <= MOST_KM2 * 1e6:
-        sides = np.maximum(extent, low)
+        sides = np.clip(extent + 2, int(LEAST_M / STEP_M), high)
         col, row = (first - (sides - extent) // 2).tolist()
         return [Window(epsg=epsg, col=col, row=row, cols=int(sides[0]), rows=int(sides[1]), built=len(steps))]
     corner = first - high

@@ -2,6 +2,9 @@
 """Splits: blocks tile a region, parts keep their distance in metres, and every fault names the pair."""
 
 import hashlib
+import re
+from itertools import combinations
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from sasgeo_bench.regions.evidence import footprint
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.tasks.split import (
     HALVES,
+    Part,
     SplitFile,
     blocks_of,
     find_split_file,
@@ -213,13 +217,14 @@ def shipped(name):
 OF_IMAGERY = {"banepa", "zanzibar"}  # of buildings alone, in a split of their own
 OF_DEMO = {name for name in list_region_files() if name.startswith("demo-")}  # have a split of their own
 COUNTRIES = {"andorra", "liechtenstein"}  # for flights; their towns are regions, too
+OF_WORLD = {name for name, path in list_region_files().items() if read_region_file(path).provenance.country}
 
 
 @pytest.mark.parametrize("name", ["crossfit", "holdout"])
 def test_the_shipped_splits_by_country_hold_the_same_regions_five_kilometres_apart(name):
     split = shipped(name)
     towns = {"canillo", "fuglafjordur", "runavik", "soldeu", "sorvagur", "tvoroyri", "vestmanna"}
-    assert set(split.spec.region_ids) == set(list_region_files()) - towns - OF_IMAGERY - COUNTRIES - OF_DEMO
+    assert set(split.spec.region_ids) == set(list_region_files()) - towns - OF_IMAGERY - COUNTRIES - OF_DEMO - OF_WORLD
     assert nearest_pair(split).gap_m >= 5000.0
 
 
@@ -233,8 +238,46 @@ def test_the_split_of_flights_has_two_countries_in_place_of_their_towns():
 
 def test_the_split_by_towns_holds_every_shipped_region_and_their_views_never_meet():
     split = shipped("places")
-    assert set(split.spec.region_ids) == set(list_region_files()) - OF_IMAGERY - COUNTRIES - OF_DEMO
+    assert set(split.spec.region_ids) == set(list_region_files()) - OF_IMAGERY - COUNTRIES - OF_DEMO - OF_WORLD
     assert nearest_pair(split).gap_m >= 2 * split.spec.reach_m + 800.0
+
+
+@pytest.fixture(scope="module")
+def world():
+    return shipped("world")
+
+
+def test_the_split_of_the_world_holds_every_real_region_and_no_made_up_one(world):
+    made_up = {name for name in list_region_files() if name.startswith(("demo-", "town-"))}
+    too_small = {"minsk", "quito", "sofia"}  # for two views side by side
+    assert set(world.spec.region_ids) == set(list_region_files()) - made_up - OF_IMAGERY - COUNTRIES - too_small
+    assert nearest_pair(world).gap_m >= 30_000.0
+
+
+def test_no_country_of_the_world_stands_in_two_parts_and_each_part_has_what_it_needs(world):
+    parts = {part: [place for place in world.spec.place if place.part == part] for part in get_args(Part)}
+    countries = {part: {place.country for place in places} for part, places in parts.items()}
+    assert None not in set().union(*countries.values())
+    assert not any(one & other for one, other in combinations(countries.values(), 2))
+    least = {"train": (30, 12), "calibration": (15, 7), "test": (65, 24)}
+    assert all(len(parts[part]) >= places for part, (places, _) in least.items())
+    assert all(len(countries[part]) >= number for part, (_, number) in least.items())
+    assert {"nepal", "czechia", "germany", "equatorial-guinea"} <= countries["train"]
+    assert "andorra" in countries["calibration"]
+    assert {"france", "faroe-islands", "isle-of-man", "liechtenstein", "monaco"} <= countries["test"]
+
+
+def test_a_place_of_the_world_lies_in_the_country_that_its_regions_state(world):
+    for place in world.spec.place:
+        stated = {read_region_file(list_region_files()[region]).provenance.country for region in place.regions}
+        names = {re.sub("[^a-z]+", "-", name.lower().replace("'", "")).strip("-") for name in stated if name}
+        assert names <= {place.country}, place.name
+
+
+def test_one_test_place_of_the_world_in_four_is_sealed_by_the_rule_of_its_file(world):
+    tests = [place for place in world.spec.place if place.part == "test"]
+    order = sorted(tests, key=lambda place: hashlib.sha256(f"sealed/{place.name}".encode()).hexdigest())
+    assert {place.name for place in world.spec.place if place.sealed} == {one.name for one in order[: len(tests) // 4]}
 
 
 def test_the_split_of_the_demo_holds_its_towns_and_each_half_as_many_kinds():

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table and the contact sheet of all real places: .venv/bin/python docs/figures/places.py --out out.
+
+`build-region --every` built them before. Views are those of the suite `clean` that overlap no other, of the newest map.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.layers import read_overview
+from sasgeo_bench.regions.preview import paint_overview
+from sasgeo_bench.regions.proposing import STEP_M
+from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
+from sasgeo_bench.tasks.build import read_scene
+from sasgeo_bench.tasks.split import Place, Split, find_split_file, make_split, read_split_file
+from sasgeo_bench.tasks.suites.base import Seeds
+from sasgeo_bench.tasks.suites.sites import choose_sites
+from sasgeo_bench.tasks.task_plan import Request
+
+SPLIT = "world"
+DOCS = Path(__file__).parents[1]
+SIDE_PX, TEXT_PX, ACROSS, QUALITY = 112, 14, 14, 62
+MOST_VIEWS = 1000  # more than any place here has
+HEAD = f"""# Places
+
+Every real place that ships, by part of the split [`{SPLIT}`](../splits/README.md) and country. *km2*: mapped ground.
+*Built*: ground in steps of {STEP_M:.0f} m with a building, km2. *Drawn*: mapped ground under any class. *Views*: of 192
+m, drawn by the suite `clean`, none of which overlaps another; a place counts with two. *Sealed* places are asked by a
+seed that is given at run time. `python docs/figures/places.py --out out` writes this page and the sheet anew, of what
+`build-region --every` built.
+
+![A small map of every region, by place](figures/places.webp)
+
+(c) OpenStreetMap contributors, ODbL. Where a file comes from stands in `regions/*.toml`.
+
+| place | country | part | what | maps | km2 | built | drawn | views |
+|---|---|---|---|---|---|---|---|---|
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """A region as it was built."""
+
+    name: str
+    title: str
+    country: str
+    dates: tuple[str, ...]
+    picture: NDArray[np.uint8]
+    mapped_km2: float
+    built_km2: float
+    drawn_share: float
+    views: int
+
+
+def measured(region: str, out: Path) -> Measured:
+    """Read a built region, and count its views."""
+    spec = read_region_file(list_region_files()[region])
+    folder = out / "regions" / region
+    manifest = region_files.read_manifest(folder)
+    overview = read_overview(folder / region_files.LAYERS, longest_cells=1024)
+    is_mapped = (overview != 255).all(axis=0)
+    is_drawn = ((overview == 1) & is_mapped).any(axis=0)
+    cell_m = manifest.cell_size_m * manifest.cols / overview.shape[2]
+    step = max(1, round(STEP_M / cell_m))
+    houses = overview[manifest.classes.index("building")] == 1
+    built = np.add.reduceat(
+        np.add.reduceat(houses, np.arange(0, houses.shape[0], step)), np.arange(0, houses.shape[1], step), axis=1
+    )
+    colours = (paint_overview(manifest, overview) * 255).astype(np.uint8)[..., ::-1]
+    scale = SIDE_PX / max(colours.shape[:2])
+    west, south, east, north = manifest.bounds_m
+    return Measured(
+        name=region,
+        title=spec.title,
+        country=spec.provenance.country or "",
+        dates=tuple(extract.date.isoformat() for extract in spec.extract),
+        picture=cv2.resize(colours, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA),
+        mapped_km2=manifest.coverage.share * (east - west) * (north - south) / 1e6,
+        built_km2=float((built > 0).sum() * (step * cell_m) ** 2 / 1e6),
+        drawn_share=float(is_drawn.sum() / max(is_mapped.sum(), 1)),
+        views=views_of(spec, out),
+    )
+
+
+@cache
+def split() -> Split:
+    """Return the split, on the lattices of its regions."""
+    spec = read_split_file(find_split_file(SPLIT))
+    files = list_region_files()
+    return make_split(spec, {name: read_region_file(files[name]).grid() for name in spec.region_ids})
+
+
+def views_of(spec: RegionFile, out: Path) -> int:
+    """Return how many views the suite `clean` finds that overlap no other."""
+    name = "clean"
+    request = Request(suite=name, suite_spec=name, region=spec, split=split(), elsewhere=None, count=2, seed=0, out=out)
+    suite = request.found
+    scene, _ = read_scene(request, suite)
+    seeds = Seeds(root=0, names=(spec.id, name, str(suite.card.version)))
+    group = suite.card.group
+    try:
+        return len(choose_sites(scene, suite, count=MOST_VIEWS, seeds=seeds, group=group, may_be_fewer=True))
+    except ConfigError:  # none
+        return 0
+
+
+def row_of(place: Place, regions: list[Measured]) -> str:
+    """Return the row of a place."""
+    first = regions[0]
+    what = first.title.partition(": ")[2] or first.title
+    days = sorted({date for one in regions for date in one.dates})
+    maps = days[0] if len(days) == 1 else f"{len(days)}, {days[0][:4]} to {days[-1][:4]}"
+    mapped = sum(one.mapped_km2 for one in regions)
+    drawn = sum(one.drawn_share * one.mapped_km2 for one in regions) / mapped
+    cells = (
+        place.name + (f" ({len(regions)})" if len(regions) > 1 else ""),
+        first.country or (place.country or "").replace("-", " ").title(),
+        f"{place.part}, sealed" if place.sealed else str(place.part),
+        what.replace("|", "/"),
+        maps,
+        f"{mapped:.1f}",
+        f"{sum(one.built_km2 for one in regions):.1f}",
+        f"{drawn:.0%}",
+        str(sum(one.views for one in regions)),
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def sheet_of(regions: list[Measured]) -> NDArray[np.uint8]:
+    """Return the small maps in rows, each above its name."""
+    rows = -(-len(regions) // ACROSS)
+    sheet = np.full((rows * (SIDE_PX + TEXT_PX) + TEXT_PX, ACROSS * SIDE_PX, 3), 255, dtype=np.uint8)
+    for number, one in enumerate(regions):
+        top, left = number // ACROSS * (SIDE_PX + TEXT_PX), number % ACROSS * SIDE_PX
+        height, width = one.picture.shape[:2]
+        sheet[top : top + height, left : left + width] = one.picture
+        write(sheet, one.name[:18], (left, top + SIDE_PX + TEXT_PX - 4))
+    write(sheet, ATTRIBUTION, (2, sheet.shape[0] - 3))
+    return sheet
+
+
+def write(sheet: NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
+    """Write a line of text."""
+    cv2.putText(sheet, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.33, (40, 40, 40), 1, cv2.LINE_AA)
+
+
+def rows_and_maps(out: Path) -> Iterator[tuple[str, list[Measured]]]:
+    """Yield the row and the regions of each place of the split."""
+    for place in split().spec.place:
+        regions = [measured(region, out) for region in place.region_ids]
+        yield row_of(place, regions), regions
+
+
+def left_out() -> list[str]:
+    """Return the regions with a country that the split does not have."""
+    specs = [read_region_file(path) for path in list_region_files().values()]
+    return sorted(spec.id for spec in specs if spec.provenance.country and spec.id not in split().spec.region_ids)
+
+
+def main() -> None:
+    """Write docs/places.md and docs/figures/places.webp."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    found = list(rows_and_maps(parser.parse_args().out))
+    sheet = sheet_of([one for _, regions in found for one in regions])
+    cv2.imwrite(str(DOCS / "figures" / "places.webp"), sheet, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
+    text = (
+        HEAD + "\n".join(row for row, _ in found) + f"\n\nIn no part, for want of two views: {', '.join(left_out())}.\n"
+    )
+    (DOCS / "places.md").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -29,7 +29,7 @@ from sasgeo_bench.core.errors import ConfigError
 Model = TypeVar("Model", bound=BaseModel)
 
 _SHORT: Final = 60  # characters
-_FEW: Final = 8  # known names, or faults, that an error lists in full
+_FEW: Final = 12  # known names, or faults, that an error lists in full
 _MOST_BYTES: Final = 10_000_000  # of a file that somebody writes by hand
 LONGEST_LINE: Final = 300
 

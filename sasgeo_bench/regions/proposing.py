@@ -127,8 +127,8 @@ def find_windows(houses_lonlat: NDArray[np.float64], *, most: int = MOST_WINDOWS
     Notes
     -----
     A step of the lattice is built if a building lies in it. If all of them fit into one window, it is that, with a step
-    around; else each window is the one with the largest count of built steps less 15 % of all its steps, so that it grows into what is
-    built. Windows do not overlap. Houses farther than 60 km from their median are left out.
+    around; else each window is the one with the largest count of built steps less 15 % of all its steps, so that it
+    grows into what is built. Windows do not overlap. Houses farther than 60 km from their median are left out.
 
     Examples
     --------

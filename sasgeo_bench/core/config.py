@@ -29,7 +29,8 @@ from sasgeo_bench.core.errors import ConfigError
 Model = TypeVar("Model", bound=BaseModel)
 
 _SHORT: Final = 60  # characters
-_FEW: Final = 12  # known names, or faults, that an error lists in full
+_FEW: Final = 8  # faults that an error lists in full
+_LISTED: Final = 12  # known names that it does
 _MOST_BYTES: Final = 10_000_000  # of a file that somebody writes by hand
 LONGEST_LINE: Final = 300
 
@@ -298,4 +299,4 @@ def _hint(name: str, known: Mapping[str, str]) -> str:
     near = difflib.get_close_matches(name, known, n=1)
     if near:
         return f", did you mean {known[near[0]]!r}?"
-    return f": there are {', '.join(sorted(known.values()))}" if 0 < len(known) <= _FEW else ""
+    return f": there are {', '.join(sorted(known.values()))}" if 0 < len(known) <= _LISTED else ""

@@ -16,11 +16,13 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table
 from sasgeo_bench.cli.options import ExtractFolders, Out
-from sasgeo_bench.core.errors import ExtractError
+from sasgeo_bench.core.errors import ExtractError, named
 from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, Extract, answers, extract_folders, find_extract
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 
 _LIBRARIES: Final = ("osmium", "shapely", "geopandas", "rasterio", "numpy", "pandas", "pyarrow")
+
+_MOST_LISTED: Final = 40  # files that are missing
 
 
 def examine(folders: Sequence[Path], *, out: Path) -> Iterator[tuple[str, str]]:
@@ -63,12 +65,12 @@ def _missing(folders: Sequence[Path]) -> Iterator[tuple[str, str]]:
     found = len(wanted) - sum(map(len, missing.values()))
     yield "extracts found", f"{found} of {len(wanted)} that the shipped regions name"
     for mend, files in sorted(missing.items()):
-        yield "missing", f"{mend}: {', '.join(sorted(files))}"
+        yield "missing", f"{mend}: {named(sorted(files), 'file', most=_MOST_LISTED)}"
 
 
 def _mend(extract: Extract) -> str:
     if not extract.urls:
-        return "no address is known, put them into one of the folders"
+        return "no address is known, region files state the source: put them into one of the folders"
     if not any(map(answers, extract.urls)):
         return "the server does not answer now, put them into one of the folders or try again later"
     return "the server answers, build-region downloads them"

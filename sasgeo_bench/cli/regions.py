@@ -12,6 +12,7 @@ import typer
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.core.errors import ConfigError, SasgeoError, named
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region import Manifest
@@ -174,7 +175,7 @@ def propose_regions(options: ProposeOptions) -> tuple[Path, ...]:
         path = options.into / f"{name}.toml"
         found.append(path)
         if path.exists():
-            if path.read_text(encoding="utf-8") != text:
+            if plain_file(path).read_text(encoding="utf-8") != text:
                 options.say(f"{path}: kept, although the manifest gives another: remove it to have that")
             continue
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -352,16 +352,16 @@ def winding(count, *, spacing_m=50.0, start_m=(2000.0, 1000.0)):
 
 def views_of(poses, *, seed=0, evidence=None, radius_m=300.0, lost=(), jumps=()):
     """The queries of a flight; at `jumps` the odometer says the step before once more."""
-    rng, queries, step = np.random.default_rng(seed), [], None
+    rng, queries, move = np.random.default_rng(seed), [], None
     for frame, pose in enumerate(poses):
         step = Step(sequence_id="f", frame=frame)
         if frame and frame not in lost:
             before = poses[frame - 1]
             off_m = np.array([pose.easting_m - before.easting_m, pose.northing_m - before.northing_m])
             if frame not in jumps:
-                step = np.array([*(rotation(before.yaw_deg).T @ off_m), float(wrap_deg(pose.yaw_deg - before.yaw_deg))])
+                move = np.array([*(rotation(before.yaw_deg).T @ off_m), float(wrap_deg(pose.yaw_deg - before.yaw_deg))])
             noise = np.array(SIGMAS) * rng.standard_normal(3)
-            increment = tuple((step * [SCALE, SCALE, 1.0] + noise).tolist())
+            increment = tuple((move * [SCALE, SCALE, 1.0] + noise).tolist())
             covariance = tuple(np.diag(np.square(SIGMAS)).ravel().tolist())
             step = replace(step, increment=increment, covariance=covariance)
         queries.append(

@@ -335,9 +335,7 @@ def test_who_fails_on_every_query_has_no_submission_and_an_example_of_it_on_one_
     request = replace(request_, matcher=f"{__name__}:Lost")
     with pytest.raises(MatchError) as caught:
         enter(plan_entry(request), into=tmp_path / "lost")
-    text = (
-        r"lost failed on all (\d+) queries \(\1 ended as crash, the first with the message [\"'].*no road.*near \w+.*"
-    )
+    why = r"lost failed on all (\d+) queries \(\1 ended as crash, the first with the message [\"'].*no road.*near \w+.*"
     assert re.fullmatch(
         rf"{why}\): mend it, raise its version and enter again; \S+lost is as it was", str(caught.value)
     )

@@ -19,6 +19,7 @@ from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.suites.twins import VOLATILE, straight_places
 from sasgeo_bench.tasks.suites.views import bent
+from tests.slow import rest_slow
 from tests.tasks.suites.conftest import ROOTS
 
 # What is measured of a stress, and grows with its strength.
@@ -60,7 +61,7 @@ def stresses(made, role="stress"):
     return [item for item in made.suite.variants if item.role == role]
 
 
-@pytest.mark.parametrize("name", SUITES)
+@pytest.mark.parametrize("name", rest_slow(SUITES, but=8))
 def test_the_same_seed_gives_the_same_draft(carried, name):
     made = carried(name)
     smallest = {item.kind: item for item in sorted(made.suite.variants, key=lambda item: -item.view_cells)}
@@ -68,7 +69,7 @@ def test_the_same_seed_gives_the_same_draft(carried, name):
         assert same_drafts(made.draw(made.sites[0], variant), made.drawn(made.sites[0], variant))
 
 
-@pytest.mark.parametrize("name", SUITES)
+@pytest.mark.parametrize("name", rest_slow(SUITES, but=8))
 def test_another_seed_gives_other_errors_of_perception(carried, name):
     made = carried(name)
     other = replace(made, seeds=replace(made.seeds, root=2))

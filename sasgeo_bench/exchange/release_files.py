@@ -66,7 +66,7 @@ licence.
 _IMAGERY: Final = """\
 # Imagery
 
-Each file has the licence of the pictures that it was cut out of; who passes it on names their authors where readers
+Each file has the licence of the pictures that it was cut out of; who passes it on must name their authors where readers
 see it. Photographs are not derived from OpenStreetMap, and not under the ODbL. What is rendered from a map is, and its
 source says so. All other files are as the notice says.
 

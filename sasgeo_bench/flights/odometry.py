@@ -274,7 +274,7 @@ def dead_reckon(flown: Trajectory, steps: Odometry) -> Trajectory:
     """Return the trajectory that an odometer believes in, from the true first pose.
 
     Positions and headings follow from the increments, heights and tilt are those of the flight. Poses within a lost
-    stretch are left out, and after it the odometer goes on from where it was: it is not reset by how far it went.
+    stretch are left out, and after it the odometer goes on from where it was: it never learns how far it went.
     """
     yaw_deg = flown.yaw_deg[0] + np.concatenate([[0.0], np.cumsum(steps.yaw_deg)])
     increments = np.stack([steps.right_m, steps.up_m, steps.yaw_deg], axis=1)

@@ -67,9 +67,8 @@ def failed_training(reply: PluginReply[AnyCard, Found]) -> PluginReply[AnyCard, 
     return PluginReply(status=reply.status, message=one_line(f"while learning: {reply.message}"))
 
 
-SegmentedQuery = tuple[
-    Query, Sequence[Segmentation | None]
-]  # a query and the segmentations of its frames, None where it failed
+# A query and the segmentations of its frames, None where it failed
+SegmentedQuery = tuple[Query, Sequence[Segmentation | None]]
 
 
 def recalibrated(segmented: Iterable[SegmentedQuery], region: Region) -> Iterator[SegmentedQuery]:

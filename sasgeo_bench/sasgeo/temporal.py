@@ -148,8 +148,8 @@ _USUAL_M: Final = 50.0  # between two views, where no odometer says it
 class SasgeoTrack:
     """The scorer's raster over time, with the parts that `switches` and `over_time` select.
 
-    `exponent_scale` is the share of the fitted exponents that a view of new ground has, `outlier_probability` that of
-    views    fits no place.
+    `exponent_scale` is the share of the fitted exponents that a view of new ground has, `outlier_probability` that
+    of a view that fits no place.
     """
 
     card: MatcherCard
@@ -229,9 +229,8 @@ class SasgeoTrack:
     def _seen(self, belief: GridBelief, query: Query) -> GridBelief:
         """Weigh the belief by a view, learn the flight's scale, and mind whether the view fits better elsewhere."""
         template = self._map.read(query).template
-        weight = self.exponent_scale * min(
-            1.0, self._new_m / template.side_m
-        )  # ground seen before says nothing new of the map
+        # Ground seen before says nothing new of the map.
+        weight = self.exponent_scale * min(1.0, self._new_m / template.side_m)
         self._new_m = 0.0
         outlier_probability = self.outlier_probability if self.over_time.has_none else 0.0
         scored = _Scored(field=self._map.field, template=template, scale=self._scale.mean, weight=weight)

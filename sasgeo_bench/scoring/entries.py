@@ -561,22 +561,22 @@ def score_entries(
     return ScoredEntries(answers=left, tasks=tuple(tasks), scores=scores, views=views)
 
 
-def scored_rows(contest: ScoredEntries, split: Split | None) -> dict[str, pd.DataFrame]:
+def scored_rows(loaded: ScoredEntries, split: Split | None) -> dict[str, pd.DataFrame]:
     """Return by entry the scored rows of the suites of which it was asked every task, without those of controls.
 
     Train places of a hold-out `split` do not count. Entries without such a suite are missing, with a line
     about the other suites of an entry. Raise ConfigError if no entry is left.
     """
     unused = {"train"} if split is not None and split.spec.kind == "holdout" else set()
-    tasks = [task for task in contest.tasks if not task.parts() <= unused]
+    tasks = [task for task in loaded.tasks if not task.parts() <= unused]
     found = {}
-    for item in contest.answers:
+    for item in loaded.answers:
         asked = {task.manifest.suite for task in tasks if task.folder in item.asked}
         lacking = {CONTROLS} | {task.manifest.suite for task in tasks if task.folder not in item.asked}
         lost = sorted(asked & lacking - {CONTROLS})
         if lost:
             tell(f"{item.entry.name}: not on the board of {', '.join(lost)}, for it was not asked all tasks there")
-        scores = contest.scores[item.entry.name]
+        scores = loaded.scores[item.entry.name]
         is_used = scores["suite"].isin(asked - lacking) & ~scores["part"].isin(unused)
         rows = some_rows(scores, is_used.to_numpy(bool))
         if len(rows):

@@ -262,7 +262,7 @@ def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_
     assert not {"brier", "cost_20"} & set(order[order["rejector"] == "order"]["metric"])
     rows = board.board.leaderboard[board.board.leaderboard["rejector"] == "doubt"]
     by_name = {row["metric"]: row for _, row in rows[rows["stratum"] == "as drawn"].iterrows()}
-    assert by_name["brier"]["value"] == 0.0  # all answers were right, and none was with_unknown_margins
+    assert by_name["brier"]["value"] == 0.0  # all answers were right, and none was doubted
     assert by_name["coverage_at_risk_0.01"]["value"] == pytest.approx(
         by_name["aurc"]["answered"] / by_name["aurc"]["n"]
     )

@@ -118,10 +118,10 @@ class PictureSuite(Suite):
         of_weather = (shot.flight_seeds or shot.seeds).rng("conditions")
         conditions = flight.conditions(draw_conditions(of_weather, season="summer"))
         painted = _painted(shot, flight)
-        stands = camera_beliefs(shot, flight)
+        beliefs = camera_beliefs(shot, flight)
         rng = shot.rng("sensor", variant.name)
-        pictures = [render(painted, stand.true, conditions, rng) for stand in stands]
-        found = [labels(painted, stand.true, season=conditions.season) for stand in stands]
+        pictures = [render(painted, belief.true, conditions, rng) for belief in beliefs]
+        found = [labels(painted, belief.true, season=conditions.season) for belief in beliefs]
         state = shot.scene.world
         is_there = "building" in state.classes
         share = float((found[-1][state.classes.index("building")] == 1).mean()) if is_there else 0.0
@@ -130,19 +130,19 @@ class PictureSuite(Suite):
             frames=tuple(
                 Frame(
                     picture=encode_webp(picture),
-                    camera=stand.believed,
+                    camera=belief.believed,
                     height_sigma_m=round(flight.height_m * self.card.group.scale_sigma, 2),
                     attitude_sigma_deg=ATTITUDE_SIGMA_DEG,
-                    position_sigma_m=stand.position_sigma_m,
-                    yaw_sigma_deg=stand.yaw_sigma_deg,
+                    position_sigma_m=belief.position_sigma_m,
+                    yaw_sigma_deg=belief.yaw_sigma_deg,
                 )
-                for stand, picture in zip(stands, pictures, strict=True)
+                for belief, picture in zip(beliefs, pictures, strict=True)
             ),
             labels=tuple(FrameLabels.of(state.classes, item) for item in found),
             measured={
                 "frames": float(len(pictures)),
                 "gsd_m": round(flight.height_m / LENS.focal_px[0], 3),
-                "tilt_deg": round(stands[-1].true.tilt_deg, 2),
+                "tilt_deg": round(beliefs[-1].true.tilt_deg, 2),
                 "brightness": round(float(np.mean(pictures)) / 255, 3),
                 "contrast": round(float(np.std(pictures[-1])) / 255, 3),
                 "hidden_share": round(float((found[-1] == UNKNOWN).mean()), 4),

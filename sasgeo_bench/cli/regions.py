@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build regions: the function and its command."""
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,6 +13,7 @@ import typer
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.core.errors import ConfigError, SasgeoError, named
+from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.regions import build
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
     from sasgeo_bench.sensing.rendering.palettes import Family
     from sasgeo_bench.sensing.rendering.seasons import Season
 
-Item = TypeVar("Item", RegionFile, build.BuildPlan)
 Result = TypeVar("Result")
 
 
@@ -107,15 +108,15 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
 
 
 def _build(plan: build.BuildPlan) -> Manifest | None:
-    return _attempt(plan, build.build_region)
+    return _attempt(plan.spec, lambda _: build.build_region(plan))
 
 
-def _attempt(item: Item, work: Callable[[Item], Result]) -> Result | None:
+def _attempt(spec: RegionFile, work: Callable[[RegionFile], Result]) -> Result | None:
     """Do what one region needs; if that fails, a line says why, and the others are done."""
     try:
-        return work(item)
+        return work(spec)
     except SasgeoError as error:
-        tell(f"{item.spec.id if isinstance(item, build.BuildPlan) else item.id}: not built: {error}")
+        tell(f"{spec.id}: not built: {error}")
         return None
 
 
@@ -158,6 +159,8 @@ def propose_regions(options: ProposeOptions) -> tuple[Path, ...]:
     ------
     ConfigError
         If the manifest cannot be read, or lacks a key.
+    StoreError
+        If a region file cannot be written.
 
     Examples
     --------
@@ -174,14 +177,20 @@ def propose_regions(options: ProposeOptions) -> tuple[Path, ...]:
     for name, text in proposed(options.manifest, folders=options.extracts or (), known=known, jobs=options.jobs):
         path = options.into / f"{name}.toml"
         found.append(path)
-        if path.exists():
-            if plain_file(path).read_text(encoding="utf-8") != text:
-                options.say(f"{path}: kept, although the manifest gives another: remove it to have that")
-            continue
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-        options.say(path)
+        if not os.path.lexists(path):
+            with fresh_file(path, mend="name another folder by --into, or check your rights") as scratch:
+                scratch.write_text(text, encoding="utf-8")
+            options.say(path)
+        elif not _holds(path, text):
+            tell(f"{path}: kept, although the manifest gives another: remove it to have that")
     return tuple(found)
+
+
+def _holds(path: Path, text: str) -> bool:
+    try:
+        return plain_file(path).read_text(encoding="utf-8") == text
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def propose_regions_command(options: ProposeOptions) -> None:

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -23,7 +24,7 @@ from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.osm.locate import Extract, PlainName, Sha256, find_extract
-from sasgeo_bench.osm.read import Reading, read_extract
+from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.osm.scan import scan_file
 from sasgeo_bench.osm.snapshot import open_snapshot
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -82,7 +83,19 @@ class ExtractManifest(Document):
                 raise ConfigError(f"{place}: two extracts are of one day: keep one of them")
             if len(countries) > 1:
                 raise ConfigError(f"{place} lies in {' and in '.join(sorted(countries))}: give each its own name")
+            other = next((name for name in names_of(place)[1:] if name in found), None)
+            if other is not None:
+                raise ConfigError(f"{other} may be the name of a second region of {place}: rename one of the places")
         return found
+
+
+def names_of(place: str) -> list[str]:
+    """Return the names that the regions of a place may have.
+
+    >>> names_of("nis")
+    ['nis', 'nis-2', 'nis-3']
+    """
+    return [place, *(f"{place}-{number}" for number in range(2, MOST_WINDOWS + 1))]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -252,7 +265,7 @@ def propose_regions(
     taken = {name for spec in known for name in (spec.id, *(extract.file for extract in spec.extract))}
     jobs_of = []
     for place, listed in places.items():
-        if not taken.isdisjoint({place, *(item.file for item in listed)}):
+        if not taken.isdisjoint({*names_of(place), *(item.file for item in listed)}):
             tell(f"{place}: has regions already")
         else:
             jobs_of.append(_Place(name=place, listed=tuple(listed), folders=(*folders, manifest.parent)))
@@ -274,11 +287,13 @@ def _proposed(place: _Place) -> list[tuple[str, str]]:
         path = find_extract(extracts[-1], folders=place.folders)
         windows = find_windows(_houses(path, place.listed[-1].date))
         found = []
-        for number, window in enumerate(windows, start=1):
-            name = place.name if number == 1 else f"{place.name}-{number}"
-            reading = _reading(path, name, window, place.listed[-1].date)
-            scenes = scenes_of(reading.features, reading.coverage)
-            found.append((name, _text(name, number, place.listed, extracts, window, scenes)))
+        for name, window in zip(names_of(place.name), windows, strict=False):
+            text = partial(_text, name, place.listed, extracts, window)
+            spec = parse_toml(
+                text(["urban"]), RegionFile, source=f"its region {name}"
+            )  # of any scene, to read the ground
+            reading = read_extract(path, spec.grid(), at=place.listed[-1].date)
+            found.append((name, text(scenes_of(reading.features, reading.coverage))))
     except SasgeoError as error:
         tell(f"{place.name}: left out: {error}")
         return []
@@ -313,31 +328,15 @@ def _houses(path: Path, date: dt.date) -> NDArray[np.float64]:
     return points
 
 
-def _reading(path: Path, name: str, window: Window, date: dt.date) -> Reading:
-    spec = RegionFile.model_validate(
-        {
-            "id": name,
-            "title": name,
-            "scenes": ["urban"],
-            "center_lonlat": window.center_lonlat,
-            "size_m": window.size_m,
-            "cell_size_m": 1.0,
-            "extract": [Extract(file=path.name, date=date, sha256=("0" * 64,))],
-        }
-    )
-    return read_extract(path, spec.grid(), at=date)
-
-
 def _text(
     name: str,
-    number: int,
     listed: Sequence[ListedExtract],
     extracts: Sequence[Extract],
     window: Window,
     scenes: Iterable[str],
 ) -> str:
     newest = listed[-1]
-    titled = newest.place.replace("-", " ").title() + (f" {number}" if number > 1 else "")
+    titled = name.replace("-", " ").title()
     width_m, height_m = window.size_m
     origin = newest.source if newest.source and not extracts[-1].urls else None
     lines = [

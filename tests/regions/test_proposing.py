@@ -11,6 +11,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sasgeo_bench.core.config import LONGEST_LINE
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import reporting
@@ -132,8 +133,9 @@ def test_what_was_changed_by_hand_is_kept(towns, manifest, program, tmp_path):
     assert program(*asked)[1] == ""
     path = tmp_path / "mine" / "mill.toml"
     path.write_text(path.read_text("utf-8").replace("garden town", "my mill"), encoding="utf-8")
-    code, printed, _ = program(*asked)
-    assert (code, printed) == (0, f"{path}: kept, although the manifest gives another: remove it to have that\n")
+    code, printed, err = program(*asked)
+    assert (code, printed) == (0, "")
+    assert f"{path}: kept, although the manifest gives another: remove it to have that\n" in err
     assert "my mill" in path.read_text("utf-8")
 
 
@@ -175,6 +177,7 @@ def test_a_place_of_a_known_region_is_left_out(towns, manifest):
         ([row(MILL, "mill"), row(MILL, "mill", country="Elsewhere")], "two extracts are of one day"),
         ([row(FIRST, "garden"), row(SECOND, "garden", country="E")], "garden lies in E and in Nowhere"),
         ([row(MILL, "The Mill")], "place"),
+        ([row(FIRST, "nis"), row(MILL, "nis-2")], "nis-2 may be the name of a second region of nis: rename one"),
         ([""], "'extract' is missing"),
     ],
 )
@@ -196,6 +199,30 @@ def test_of_every_region_one_that_cannot_be_built_costs_no_other(towns, manifest
     assert "garden: not built: garden-2020-01-01.osm.pbf (SHA-256 0000" in err
     assert err.splitlines()[-1].endswith("not built: 1 region (garden) of 2; the lines above say why")
     assert read_manifest(out / "regions" / "mill").id == "mill"
+
+
+def test_a_folder_that_cannot_be_written_into_is_a_line_and_nothing_is_left(towns, manifest, mistake, tmp_path):
+    into = tmp_path / "mine"
+    into.write_text("a file", encoding="utf-8")
+    line = mistake("propose-regions", manifest(row(MILL, "mill")), "--into", into, "--extracts", towns)
+    assert f"{into / 'mill.toml'} cannot be written" in line
+    assert into.read_text(encoding="utf-8") == "a file"
+
+
+def test_a_region_that_no_file_could_state_is_left_out_with_a_line(towns, manifest):
+    listed = manifest(row(FIRST, "a", what="x" * (LONGEST_LINE - 5)), row(MILL, "b"))
+    lines = []
+    with reporting(lines.append):
+        assert [name for name, _ in propose_regions(listed, folders=[towns])] == ["b"]
+    assert lines[0].startswith("a: left out: its region a: 'title': String should have at most")
+
+
+def test_any_printable_text_comes_back_from_the_file_as_it_was(towns, manifest):
+    odd = 'quote " and \\ and <b>bold</b> | ü'
+    ((_, text),) = propose_regions(manifest(row(MILL, "mill", country=odd, what=odd, source=odd)), folders=[towns])
+    spec = proposing.parse_toml(text, proposing.RegionFile, source="mill")
+    assert (spec.provenance.country, spec.provenance.source) == (odd, odd)
+    assert spec.title == f"Mill, {odd}: {odd}"
 
 
 def test_regions_are_named_or_every_one_is_built(mistake):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.layers import read_overview
+from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import paint_overview
 from sasgeo_bench.regions.proposing import STEP_M
 from sasgeo_bench.regions.region import ATTRIBUTION
@@ -34,10 +34,10 @@ MOST_VIEWS = 1000  # more than any place here has
 HEAD = f"""# Places
 
 Every real place that ships, by part of the split [`{SPLIT}`](../splits/README.md) and country. *km2*: mapped ground.
-*Built*: ground in steps of {STEP_M:.0f} m with a building, km2. *Drawn*: mapped ground under any class. *Views*: of 192
-m, drawn by the suite `clean`, none of which overlaps another; a place counts with two. *Sealed* places are asked by a
-seed that is given at run time. `python docs/figures/places.py --out out` writes this page and the sheet anew, of what
-`build-region --every` built.
+*Built*: mapped ground in steps of {STEP_M:.0f} m with a building. *Drawn*: mapped ground under any class. *Views*: of
+192 m, drawn by the suite `clean`, none of which overlaps another of its region (a few regions of one city share up to
+1 km2); a place counts with two. *Sealed* places are asked by a seed that is given at run time. `python
+docs/figures/places.py --out out` writes this page and the sheet anew, of what `build-region --every` built.
 
 ![A small map of every region, by place](figures/places.webp)
 
@@ -69,14 +69,11 @@ def measured(region: str, out: Path) -> Measured:
     folder = out / "regions" / region
     manifest = region_files.read_manifest(folder)
     overview = read_overview(folder / region_files.LAYERS, longest_cells=1024)
-    is_mapped = (overview != 255).all(axis=0)
-    is_drawn = ((overview == 1) & is_mapped).any(axis=0)
-    cell_m = manifest.cell_size_m * manifest.cols / overview.shape[2]
-    step = max(1, round(STEP_M / cell_m))
-    houses = overview[manifest.classes.index("building")] == 1
-    built = np.add.reduceat(
-        np.add.reduceat(houses, np.arange(0, houses.shape[0], step)), np.arange(0, houses.shape[1], step), axis=1
-    )
+    layers = read_layers(folder / region_files.LAYERS)
+    is_mapped = (layers != 255).all(axis=0)  # beyond the map
+    houses = (layers[manifest.classes.index("building")] == 1) & is_mapped
+    cells = round(STEP_M / manifest.cell_size_m)  # of a step
+    built_cells = (steps(houses, cells) > 0) * steps(is_mapped, cells)
     colours = (paint_overview(manifest, overview) * 255).astype(np.uint8)[..., ::-1]
     scale = SIDE_PX / max(colours.shape[:2])
     west, south, east, north = manifest.bounds_m
@@ -87,10 +84,16 @@ def measured(region: str, out: Path) -> Measured:
         dates=tuple(extract.date.isoformat() for extract in spec.extract),
         picture=cv2.resize(colours, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA),
         mapped_km2=manifest.coverage.share * (east - west) * (north - south) / 1e6,
-        built_km2=float((built > 0).sum() * (step * cell_m) ** 2 / 1e6),
-        drawn_share=float(is_drawn.sum() / max(is_mapped.sum(), 1)),
+        built_km2=float(built_cells.sum() * manifest.cell_size_m**2 / 1e6),
+        drawn_share=float(((layers == 1).any(axis=0) & is_mapped).sum() / max(is_mapped.sum(), 1)),
         views=views_of(spec, out),
     )
+
+
+def steps(mask: NDArray[np.bool_], cells: int) -> NDArray[np.int64]:
+    """Return how many cells of a mask each square of so many cells holds."""
+    rows, cols = (np.arange(0, length, cells) for length in mask.shape)
+    return np.add.reduceat(np.add.reduceat(mask.astype(np.int64), rows), cols, axis=1)
 
 
 @cache

@@ -205,14 +205,14 @@ def _best(gain: NDArray[np.float64], low: int, high: int) -> tuple[int, int, int
 
 URBAN: Final = 0.15  # share of the mapped ground under buildings
 SUBURBAN: Final = 0.03
-INDUSTRIAL: Final = 0.4  # share of that under buildings of 1500 m2 and more
-_LARGE_M2: Final = 1500.0
 FIELDS: Final = 0.15  # share of the mapped ground
 WATER: Final = 0.02
 
 
 def scenes_of(features: gpd.GeoDataFrame, ground: shapely.Geometry) -> list[str]:
-    """Return the kinds of ground of a region, measured on what is mapped of it.
+    """Return the kinds of ground of a region, measured on what is mapped of it; "suburban" where none is found.
+
+    Industry is not told: large buildings are campuses and city blocks as often as works.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def scenes_of(features: gpd.GeoDataFrame, ground: shapely.Geometry) -> list[str]
     >>> squares = [shapely.box(0, 0, 40, 40), shapely.box(60, 0, 100, 100)]
     >>> features = gpd.GeoDataFrame({"class": ["building", "farmland"]}, geometry=squares)
     >>> scenes_of(features.assign(osm_type="way"), shapely.box(0, 0, 100, 100))
-    ['urban', 'industrial', 'agricultural']
+    ['urban', 'agricultural']
     """
     names, shapes = features["class"].to_numpy(str), features.geometry.to_numpy()
     is_area = np.isin(shapely.get_type_id(shapes), (3, 6))
@@ -234,13 +234,11 @@ def scenes_of(features: gpd.GeoDataFrame, ground: shapely.Geometry) -> list[str]
     def share(name: str) -> float:
         return float(shapely.area(shapely.intersection(shapes[is_area & (names == name)], ground)).sum() / ground.area)
 
-    houses_m2 = shapely.area(shapes[is_area & (names == "building")])
-    built, large = share("building"), houses_m2[houses_m2 >= _LARGE_M2].sum() / max(houses_m2.sum(), 1.0)
+    built = share("building")
     is_coast = bool((features["osm_type"] == "coastline").any())
     found = {
         "urban": built >= URBAN,
         "suburban": SUBURBAN <= built < URBAN,
-        "industrial": built >= SUBURBAN and large >= INDUSTRIAL,
         "riverside": share("water") >= WATER and not is_coast,
         "coastal": is_coast,
         "agricultural": share("farmland") >= FIELDS,

@@ -280,6 +280,14 @@ def test_one_test_place_of_the_world_in_four_is_sealed_by_the_rule_of_its_file(w
     assert {place.name for place in world.spec.place if place.sealed} == {one.name for one in order[: len(tests) // 4]}
 
 
+def test_no_view_of_a_sealed_place_of_the_world_shows_ground_that_is_asked_openly(world):
+    sides = {"sealed": [], "open": []}
+    for place in world.spec.place:
+        if place.part == "test":
+            sides["sealed" if place.sealed else "open"] += world.blocks[place.name]
+    assert nearest_blocks(sides).gap_m >= 2 * world.spec.reach_m
+
+
 def test_the_split_of_the_demo_holds_its_towns_and_each_half_as_many_kinds():
     split = shipped("demo")
     assert set(split.spec.region_ids) == OF_DEMO

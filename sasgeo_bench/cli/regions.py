@@ -127,9 +127,13 @@ def _wanted(options: BuildOptions) -> list[RegionFile]:
         raise ConfigError("name regions to build, or build --every region, not both: list regions shows them")
     if not options.every:
         return [read_region_file(find_region_file(name, folders=folders)) for name in options.region or ()]
-    found = [read_region_file(path) for path in list_region_files(folders=folders).values()]
-    own = {path.stem for folder in folders for path in folder.glob("*.toml")}
-    return [spec for spec in found if (spec.id in own if own else spec.extract[0].town is None)]
+    if not folders:
+        shipped = [read_region_file(path) for path in list_region_files().values()]
+        return [spec for spec in shipped if spec.extract[0].town is None]
+    found = [read_region_file(path) for folder in folders for path in sorted(folder.glob("*.toml"))]
+    if not found:
+        raise ConfigError(f"{', '.join(map(str, folders))}: no region file (*.toml) to build")
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
-from sasgeo_bench.osm.locate import Extract, PlainName, Sha256, find_extract
+from sasgeo_bench.osm.locate import Extract, PlainName, Sha256, extract_folders, find_extract
 from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.osm.scan import scan_file
 from sasgeo_bench.osm.snapshot import open_snapshot
@@ -302,7 +302,8 @@ def _proposed(place: _Place) -> list[tuple[str, str]]:
 
 def _extract(item: ListedExtract, folders: Sequence[Path]) -> Extract:
     """Return the extract of a region file; the file itself gives a hash that is missing."""
-    path = next((folder / item.file for folder in folders if (folder / item.file).is_file()), None)
+    places = (folder / item.file for folder in extract_folders(folders))
+    path = next((path for path in places if path.is_file()), None)
     if item.sha256 is None and path is None:
         raise ConfigError(f"{item.file} has no sha256, and is in none of the folders: add one, or put the file there")
     first = item.sha256 or sha256_of(path or Path(item.file))

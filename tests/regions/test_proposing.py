@@ -225,6 +225,15 @@ def test_any_printable_text_comes_back_from_the_file_as_it_was(towns, manifest):
     assert spec.title == f"Mill, {odd}: {odd}"
 
 
+def test_an_empty_folder_builds_nothing(tmp_path, mistake):
+    assert "no region file (*.toml) to build" in mistake("build-region", "--every", "--region-files", tmp_path)
+
+
+def test_files_are_found_where_other_commands_find_them(towns, manifest, monkeypatch):
+    monkeypatch.setenv("SASGEO_EXTRACTS", str(towns))
+    assert [name for name, _ in propose_regions(manifest(row(MILL, "mill")))] == ["mill"]
+
+
 def test_regions_are_named_or_every_one_is_built(mistake):
     line = "name regions to build, or build --every region, not both"
     assert line in mistake("build-region")

@@ -130,10 +130,10 @@ def _wanted(options: BuildOptions) -> list[RegionFile]:
     if not folders:
         shipped = [read_region_file(path) for path in list_region_files().values()]
         return [spec for spec in shipped if spec.extract[0].town is None]
-    found = [read_region_file(path) for folder in folders for path in sorted(folder.glob("*.toml"))]
-    if not found:
+    paths = [path for folder in folders for path in sorted(folder.glob("*.toml"))]
+    if not paths:
         raise ConfigError(f"{', '.join(map(str, folders))}: no region file (*.toml) to build")
-    return found
+    return [read_region_file(path) for path in paths]
 
 
 @dataclass(frozen=True, kw_only=True)

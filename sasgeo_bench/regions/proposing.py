@@ -4,7 +4,7 @@
 import datetime as dt
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,8 +16,8 @@ import shapely
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
-from sasgeo_bench.core.config import Document, Line, parse_toml
-from sasgeo_bench.core.errors import ConfigError, SasgeoError
+from sasgeo_bench.core.config import LONGEST_LINE, Document, Line, parse_toml
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, named
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
@@ -253,7 +253,8 @@ def propose_regions(
 
     Files are looked for as `build_region` does, in `folders` and beside the manifest first. A place is left out if a
     region of `known` has its name or one of its extracts, or if its newest extract cannot be read, or has no building:
-    a line says which. Raise `ConfigError` if the manifest is wrong.
+    a line says which. Raise `ConfigError` if the manifest is wrong, and once all others are done if a place is left out
+    for a fault.
     """
     try:
         text = plain_file(manifest).read_text(encoding="utf-8")
@@ -267,8 +268,12 @@ def propose_regions(
             tell(f"{place}: has regions already")
         else:
             jobs_of.append(_Place(name=place, listed=tuple(listed), folders=(*folders, manifest.parent)))
-    for found in spread(reported(_proposed), jobs_of, jobs=jobs, label="places read"):
+    left = []
+    for one, found in zip(jobs_of, spread(reported(_proposed), jobs_of, jobs=jobs, label="places read"), strict=True):
         yield from found
+        left += [] if found else [one.name]
+    if left:
+        raise ConfigError(f"no region of {named(left, 'place')} of {len(places)}; the lines above say why")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -337,7 +342,9 @@ def _text(
     newest = listed[-1]
     titled = name.replace("-", " ").title()
     width_m, height_m = window.size_m
-    origin = newest.source if newest.source and not extracts[-1].urls else None
+    dated_by = _of_dates({item.date: item.date_known_by for item in listed})
+    stated = zip(listed, extracts, strict=True)
+    origin = _of_dates({item.date: item.source for item, extract in stated if not extract.urls})
     lines = [
         "# Extract (c) OpenStreetMap contributors, ODbL 1.0.",
         f"id = {_quoted(name)}",
@@ -349,7 +356,7 @@ def _text(
         "",
         "[provenance]",
         f"country = {_quoted(newest.country)}",
-        *([f"dated_by = {_quoted(newest.date_known_by)}"] if newest.date_known_by else []),
+        *([f"dated_by = {_quoted(dated_by)}"] if dated_by else []),
         *([f"source = {_quoted(origin)}"] if origin else []),
     ]
     for extract in extracts:
@@ -357,6 +364,20 @@ def _text(
         lines += ["", "[[extract]]", f"file = {_quoted(extract.file)}", f"date = {extract.date.isoformat()}"]
         lines += [f"sha256 = [\n{hashes}]", *([f"urls = [{_quoted(extract.urls[0])}]"] if extract.urls else [])]
     return "\n".join(lines) + "\n"
+
+
+def _of_dates(texts: Mapping[dt.date, str | None]) -> str | None:
+    """Return a text that all dates share, or each after its date; those of the last dates if it would be too long.
+
+    >>> _of_dates({dt.date(2014, 1, 1): "header", dt.date(2018, 1, 1): "name"})
+    '2014-01-01: header; 2018-01-01: name'
+    """
+    if len(set(texts.values())) <= 1:
+        return next(iter(texts.values()), None)
+    lines = [f"{date.isoformat()}: {text}" for date, text in texts.items() if text]
+    while len("; ".join(lines)) > LONGEST_LINE:
+        del lines[0]
+    return "; ".join(lines) or None
 
 
 def _quoted(text: str) -> str:

@@ -127,6 +127,14 @@ def test_a_line_of_a_manifest_is_a_region_that_is_built_and_knows_its_country(to
     assert read_manifest(out / "regions" / "garden").counts["building"] > 20
 
 
+def test_each_date_keeps_how_it_is_known_and_where_it_comes_from(towns, manifest):
+    rows = (row(FIRST, "garden", date_known_by="header", source="shelf 1"), row(SECOND, "garden", source="shelf 2"))
+    ((_, text),) = propose_regions(manifest(*rows), folders=[towns])
+    stated = proposing.parse_toml(text, proposing.RegionFile, source="garden").provenance
+    assert stated.source == "2015-01-01: shelf 1; 2020-01-01: shelf 2"
+    assert stated.dated_by == "2015-01-01: header"
+
+
 def test_what_was_changed_by_hand_is_kept(towns, manifest, program, tmp_path):
     asked = ("propose-regions", manifest(row(MILL, "mill")), "--into", tmp_path / "mine", "--extracts", towns)
     program(*asked)
@@ -149,9 +157,9 @@ def test_an_address_is_one_to_load_from_only_with_the_hash_of_what_lies_there(to
 
 def test_a_place_that_cannot_be_read_is_left_out_with_a_line(towns, manifest):
     rows = (row("gone-2020-01-01.osm.pbf", "gone"), row("lost-2020-01-01.osm.pbf", "lost", sha256="0" * 64))
-    lines = []
-    with reporting(lines.append):
-        found = [name for name, _ in propose_regions(manifest(*rows, row(MILL, "mill")), folders=[towns])]
+    lines, found = [], []
+    with reporting(lines.append), pytest.raises(ConfigError, match=r"no region of 2 places \(gone, lost\) of 3"):
+        found.extend(name for name, _ in propose_regions(manifest(*rows, row(MILL, "mill")), folders=[towns]))
     assert found == ["mill"]
     assert "gone: left out: gone-2020-01-01.osm.pbf has no sha256, and is in none of the folders" in lines[0]
     assert "lost: left out: lost-2020-01-01.osm.pbf (SHA-256 0000" in lines[1]
@@ -212,8 +220,8 @@ def test_a_folder_that_cannot_be_written_into_is_a_line_and_nothing_is_left(town
 def test_a_region_that_no_file_could_state_is_left_out_with_a_line(towns, manifest):
     listed = manifest(row(FIRST, "a", what="x" * (LONGEST_LINE - 5)), row(MILL, "b"))
     lines = []
-    with reporting(lines.append):
-        assert [name for name, _ in propose_regions(listed, folders=[towns])] == ["b"]
+    with reporting(lines.append), pytest.raises(ConfigError, match=r"no region of 1 place \(a\) of 2"):
+        list(propose_regions(listed, folders=[towns]))
     assert lines[0].startswith("a: left out: its region a: 'title': String should have at most")
 
 

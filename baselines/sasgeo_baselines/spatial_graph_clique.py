@@ -28,7 +28,7 @@ class SpatialGraphClique(ObjectMatcher):
         version="1",
         title="Maximum clique of objects with the same distances",
         source=(
-            "Matsuzaki, Koide, Oishi, Yokozuka and Banno, Single-ViewRequest Global Localization via Graph-Theoretic "
+            "Matsuzaki, Koide, Oishi, Yokozuka and Banno, Single-Shot Global Localization via Graph-Theoretic "
             "Correspondence Matching, arXiv 2306.03641, as its abstract describes it: instances in a segmented picture "
             "and in a labelled 3D point cloud, joined by the maximum clique of their correspondences; shown on "
             "simulated towns, not from the air"

@@ -14,6 +14,7 @@ from sasgeo_bench.core.errors import ConfigError, SasgeoError
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.progress import reporting, silent
 from sasgeo_bench.core.texts import message_of
+from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.running.testing import Check, check_of, tried
 from sasgeo_bench.tasks.build import check_task, make_tasks, plan_draw
 from sasgeo_bench.tasks.query import Query, Truth
@@ -156,7 +157,8 @@ class _Kit:
                 return f"{variant.name} has no control with a view of its size"
             for site in self.sites:
                 one, two = self._draft(site, variant, _AsControl), self._draft(site, control)
-                if (one.evidence.cells != two.evidence.cells).any() and one.evidence.unknown_share != 1:
+                is_seen = one.evidence.cells != UNKNOWN
+                if (one.evidence.cells != two.evidence.cells)[is_seen].any():
                     return f"{variant.name} shows something else than the control, so that a method may gain on it"
         return None
 

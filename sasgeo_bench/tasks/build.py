@@ -233,6 +233,8 @@ def read_scene(request: Request, suite: Suite) -> tuple[Scene, Region]:
         looks={block.id: look_of(request.split, block) for block in blocks} if suite.is_pictured else {},
         profile=request.choice.profile,
     )
+    if "natural twins" in needs:
+        scene = replace(scene, natural=suite.mine(scene, request.group))
     return scene, base
 
 

@@ -53,7 +53,7 @@ def edit_maps(
             f"{suite.card.name!r}: lower --n or pass --up-to"
         )
     # Tried on the unedited map, so that no edited map is written without a query to ask on it.
-    trial = replace(drawer, scene=replace(scene, twins=edit.twins))
+    trial = replace(drawer, scene=replace(scene, twins=edit.twins, look_alikes=edit.elsewhere))
     reasons = Counter(map(trial.why_not, trial.jobs(edit.sites)))
     if None not in reasons:
         raise nothing_to_ask(request, suite, reasons)

@@ -37,7 +37,7 @@ from sasgeo_bench.tasks.suites.mining import (
     mine,
     shuffled_poses,
 )
-from sasgeo_bench.tasks.suites.rivals import RivalCheck, kind_of
+from sasgeo_bench.tasks.suites.rivals import NEAR_M, RivalCheck, kind_of
 
 CANDIDATES: Final = (10, 50, 200)  # per query; sites take turns
 LEAST_DRAWN: Final = 0.01  # of a view's cells: with fewer drawn cells on the map the truth cannot be found
@@ -137,7 +137,8 @@ class Drawer:
         pose = draft.pose or site.pose
         # Twins that the disc of a query must hold: none for retrieval, whose candidates hold them
         rivals_m = self._twins_m(job.site, draft) if self.suite.has_rivals and job.track == "localization" else ()
-        prior = make_prior(pose, group, rng=seeds.rng("prior", group.name), rivals_m=rivals_m)
+        rng = seeds.rng("prior", group.name)
+        prior = make_prior(pose, group, rng=rng, rivals_m=rivals_m, around_m=draft.around_m, omits_m=draft.omits_m)
         if rivals_m:
             listed = self.rivals.measure(state, draft.evidence, prior, truth_m=site.en_m, rivals_m=rivals_m)
             draft = replace(draft, measured=draft.measured | listed)
@@ -194,7 +195,7 @@ class Drawer:
             pair_id=self._site_seeds(site).digest("pair", job.track).hex()[:16],
             role=variant.role,
             kind=kind_of(variant.role, variant.kind, draft.measured),
-            strength=variant.strength,
+            strength=variant.strength if draft.strength is None else draft.strength,
             strength_unit=self.suite.card.strength_unit,
             unknown_share=draft.evidence.unknown_share,
             changed_share=changed,
@@ -283,12 +284,19 @@ def _clusters(
 
 
 def make_prior(
-    pose: Pose, group: PriorGroup, *, rng: np.random.Generator, rivals_m: Sequence[tuple[float, float]] = ()
+    pose: Pose,
+    group: PriorGroup,
+    *,
+    rng: np.random.Generator,
+    rivals_m: Sequence[tuple[float, float]] = (),
+    around_m: tuple[float, float] | None = None,
+    omits_m: Sequence[tuple[float, float]] = (),
 ) -> Prior:
     """Draw a prior: a disc that holds the truth anywhere, and a heading and a scale off by their sigmas.
 
     With rivals the disc holds them too: its centre is uniform over the places that allow it, which are the same
-    whichever of them is the truth.
+    whichever of them is the truth. With `omits_m` the disc holds the truth, or `around_m` in its place, and lies clear
+    of those places; its centre is uniform over what allows that.
     """
     turn, radius_share, yaw_noise = rng.uniform(0, 2 * np.pi), np.sqrt(rng.random()), rng.standard_normal()
     center_m = None
@@ -299,6 +307,9 @@ def make_prior(
         if rivals_m:
             places_m = np.array([(pose.easting_m, pose.northing_m), *rivals_m])
             center_m = _holding(places_m, reach_m, rng=rng)
+        elif omits_m:
+            held_m = np.array([around_m or (pose.easting_m, pose.northing_m)])
+            center_m = _holding(held_m, reach_m, rng=rng, omits_m=np.array(omits_m))
     sigma_deg = YAW_SIGMA_DEG[group.yaw]
     yaw_deg = None if sigma_deg is None else round(round(float(pose.yaw_deg + sigma_deg * yaw_noise), 1) % 360, 1)
     return Prior(
@@ -310,14 +321,27 @@ def make_prior(
     )
 
 
-def _holding(places_m: NDArray[np.float64], reach_m: float, *, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre."""
+def _holding(
+    places_m: NDArray[np.float64],
+    reach_m: float,
+    *,
+    rng: np.random.Generator,
+    omits_m: NDArray[np.float64] | None = None,
+) -> tuple[float, float]:
+    """Draw a point uniformly from those within reach of all places, shape (N, 2), and none of others; to a decimetre.
+
+    Others are `NEAR_M` out of reach at least, so that no answer beside the disc's rim counts as one of them.
+    """
     low, high = places_m.max(axis=0) - reach_m, places_m.min(axis=0) + reach_m
     # Drawn from the smallest square that holds them all, which does not depend on the order of the places.
     # 1024 points drawn for a centre, of which one at least should fit
     points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (1024, 2))
     off_m = np.hypot(*(points[:, None] - places_m).transpose(2, 0, 1))
-    fit = points[(off_m <= reach_m).all(axis=1)]
+    is_fit = (off_m <= reach_m).all(axis=1)
+    if omits_m is not None:
+        out_m = np.hypot(*(points[:, None] - omits_m).transpose(2, 0, 1))
+        is_fit &= (out_m > reach_m + NEAR_M).all(axis=1)
+    fit = points[is_fit]
     if len(fit) == 0:
         raise ConfigError(f"no disc of {reach_m + _ROUNDED_M:g} m holds a place and all its twins: use a wider prior")
     return (round(float(fit[0, 0]), 1), round(float(fit[0, 1]), 1))

@@ -8,7 +8,7 @@ from sasgeo_bench.core.errors import ConfigError, MatchError
 from sasgeo_bench.core.plugins import SUITES as GROUP
 from sasgeo_bench.core.plugins import check_own_name, find_inside, list_entry_points, made, plugin_code
 from sasgeo_bench.tasks.query import BY
-from sasgeo_bench.tasks.suites import ages, board_controls, flights, pictures, twins, views
+from sasgeo_bench.tasks.suites import ages, board_controls, flights, natural, pictures, twins, views
 from sasgeo_bench.tasks.suites.base import Suite
 from sasgeo_bench.tasks.suites.flights import FlightSuite
 
@@ -31,6 +31,8 @@ SUITES: Final[dict[str, Suite]] = {
         twins.STABLE_NOT_DISTINCTIVE,
         twins.ALIAS,
         views.ABSENT,
+        natural.NATURAL_TWINS,
+        natural.NATURAL_ABSENT,
         views.TELEMETRY,
     )
 }

@@ -30,7 +30,30 @@ if TYPE_CHECKING:
 
 MAIN_VIEW_CELLS: Final = 192
 VIEW_CELLS: Final = (96, 192, 384)
-Need = Literal["older maps", "another region", "rates of ageing", "imagery", "degraded map"]
+ANCHOR_SPREAD: Final = 0.2  # largest distance of a site from its anchor, as a fraction of the view's side
+Need = Literal["older maps", "another region", "rates of ageing", "imagery", "degraded map", "natural twins"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NaturalTwin:
+    """Two places that look alike and were found, not made.
+
+    `place_m` and `twin_m` are easting and northing; a view at the first looks like one at the second with a heading
+    `turn_deg` clockwise of its own. `likeness`, 0..1, is the share of what is drawn at either that the other shows.
+    `rank` counts from 1, the likest pair of the map by the scorers that proposed it.
+    """
+
+    place_m: tuple[float, float]
+    twin_m: tuple[float, float]
+    turn_deg: float
+    likeness: float
+    rank: int = 0
+
+    def pose(self, seen: Pose) -> Pose:
+        """Return where the twin would be seen as the place is seen from a pose."""
+        easting_m, northing_m = self.twin_m
+        yaw_deg = (seen.yaw_deg + self.turn_deg) % 360
+        return replace(seen, easting_m=easting_m, northing_m=northing_m, yaw_deg=yaw_deg)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +64,8 @@ class Scene:
     first, or a degraded one; `elsewhere` is another place; `imagery` is that of the region; `scenes` are its tags;
     `twins` are the places that look like each site; `ageing` has the rates of other places; `looks` are the families of
     palettes and materials of pictures, by block, and `painted` the last windows that were painted; `profile` has the
-    errors of the detector "profile".
+    errors of the detector "profile". `natural` has the pairs of places of the map that look alike, `look_alikes` for
+    each site its twin elsewhere.
     """
 
     map: State
@@ -57,6 +81,8 @@ class Scene:
     looks: Mapping[str, Family] = field(default_factory=dict)
     painted: dict[tuple[object, ...], Painted] = field(default_factory=dict, repr=False)
     profile: PerceptionProfile | None = None
+    natural: tuple[NaturalTwin, ...] = ()
+    look_alikes: Mapping[int, NaturalTwin] = field(default_factory=dict)
 
     def state(self, region: str) -> State:
         """Return the state of a map by its name."""
@@ -171,8 +197,10 @@ class QueryDraft:
     `vectors` are in the view's frame. `pose` is where the view was taken, if that is not the site; `has_pose` is False
     if it was not taken in this map. For retrieval, `is_removed` removes the true place from the candidates,
     `neighbours_m` replaces each candidate by a cluster of places, and `has_twins` adds the site's twins. `away_m` is
-    the least distance from the truth to the rim of a searched disc that excludes it. `group` overrides the prior group.
-    `density` is that of the seen place, if that is not the site. `frames` are pictures with what is believed of their
+    the least distance from the truth to the rim of a searched disc that excludes it. `around_m` is the place that the
+    disc holds, if not the truth, and `omits_m` are places that it must not hold. `group` overrides the prior group.
+    `density` is that of the seen place, if that is not the site; `strength` is that of the stress, if the place and not
+    the variant sets it. `frames` are pictures with what is believed of their
     cameras, `labels` what is on them; their evidence is all unknown until a segmenter has seen them.
     """
 
@@ -185,10 +213,13 @@ class QueryDraft:
     neighbours_m: tuple[tuple[float, float], ...] = ()
     has_twins: bool = True
     away_m: float = 0.0
+    around_m: tuple[float, float] | None = None
+    omits_m: tuple[tuple[float, float], ...] = ()
     group: PriorGroup | None = None
     density: float | None = None
     season: str = ""
     changed_share: float | None = None
+    strength: float | None = None
     measured: dict[str, float] = field(default_factory=dict)
     frames: tuple[Frame, ...] = ()
     labels: tuple[FrameLabels, ...] = ()
@@ -228,13 +259,15 @@ class Edit:
     """Changes of a map before queries are drawn.
 
     `map_pastes` make the searched map, `world_pastes` the seen world (None if it is the map itself); `sites` are the
-    remaining ones, some of them moved to a copy; `twins` are the places that look like each of them, by its index.
+    remaining ones, some of them moved to a copy; `twins` are the places that look like each of them, by its index, and
+    `elsewhere` its look-alike in the other region.
     """
 
     sites: tuple[Site, ...]
     map_pastes: tuple[Paste, ...]
     world_pastes: tuple[Paste, ...] | None
     twins: dict[int, tuple[tuple[float, float], ...]]
+    elsewhere: dict[int, NaturalTwin] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -305,6 +338,15 @@ class Suite(ABC):
     def anchors(self, scene: Scene) -> NDArray[np.float64] | None:  # noqa: ARG002
         """Return places (easting, northing) that sites must be near, shape (N, 2); None for anywhere."""
         return None
+
+    @property
+    def anchor_spread_m(self) -> float:
+        """Return the largest distance of a site from its anchor, east and north."""
+        return ANCHOR_SPREAD * self.main_side_m
+
+    def mine(self, scene: Scene, group: PriorGroup | None) -> tuple[NaturalTwin, ...]:  # noqa: ARG002
+        """Return the pairs of places of the map that look alike, for a suite that needs "natural twins"."""
+        return ()
 
     def edit(self, scene: Scene, sites: Sequence[Site], seeds: "Seeds") -> Edit | None:  # noqa: ARG002
         """Return the changes of map and world that the sites need, or None."""

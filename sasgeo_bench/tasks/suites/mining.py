@@ -40,23 +40,25 @@ class Windows:
     """Every place on a lattice of a map, with the descriptors of four scorers.
 
     `points_m` is easting and northing, shape (N, 2). Each descriptor of `plain` and `spectrum` has shape (N, D); those
-    of `plain` have columns of unit variance over the map. `polar` has shape (N, D, sectors); `shares`, shape (N, D),
-    are fractions of the drawn classes in rings, 0..1.
+    of `plain` have columns of unit variance over the map, or another one; `spread` is what they were divided by.
+    `polar` has shape (N, D, sectors); `shares`, shape (N, D), are fractions of the drawn classes in rings, 0..1.
     """
 
     points_m: NDArray[np.float64]
     radius_m: float
     shares: Floats
     plain: dict[str, Floats]
+    spread: dict[str, Floats]
     polar: Floats
     spectrum: Floats
 
 
-def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
+def describe(state: State, *, side_m: float, clear_m: float, like: Windows | None = None) -> Windows:
     """Describe every mapped place of a map, on a lattice, for views of one side.
 
     A square of half side `clear_m` around a place must be mapped, as around a site: a place nearer to the rim of the
-    map could not be the true one.
+    map could not be the true one. `like` are windows of another map of the same classes whose scale is taken, so that
+    the two can be compared.
 
     Notes
     -----
@@ -85,15 +87,18 @@ def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
     drawn = [index for index, name in enumerate(state.classes) if name in (*DRAWN_CLASSES, "water")]
     areas = np.array([kernel.size for kernel in kernels], dtype=np.float32)
     polar = _polar(shares, cells, radius)
+    tables = {
+        "histogram": (rings * areas).sum(axis=2) / areas.sum(),
+        "rings": rings.reshape(len(cells), -1),
+        "graph": _node_counts(state.graph.nodes, grid.to_centres_m(cells), side_m / 2),
+    }
+    spread = {name: _spread(table) for name, table in tables.items()} if like is None else like.spread
     return Windows(
         points_m=grid.to_centres_m(cells),
         radius_m=side_m / 2,
         shares=rings[:, drawn].reshape(len(cells), -1),
-        plain={
-            "histogram": _scaled((rings * areas).sum(axis=2) / areas.sum()),
-            "rings": _scaled(rings.reshape(len(cells), -1)),
-            "graph": _scaled(_node_counts(state.graph.nodes, grid.to_centres_m(cells), side_m / 2)),
-        },
+        plain={name: np.asarray(table / spread[name], dtype=np.float32) for name, table in tables.items()},
+        spread=spread,
         polar=polar,
         spectrum=np.abs(np.fft.rfft(polar, axis=2)).astype(np.float32).reshape(len(cells), -1),
     )
@@ -158,9 +163,10 @@ def _node_counts(nodes: "gpd.GeoDataFrame", points_m: NDArray[np.float64], radiu
     return np.sqrt(counts)
 
 
-def _scaled(table: Floats) -> Floats:
+def _spread(table: Floats) -> Floats:
+    """Return the standard deviation of each column, 1 for one that is the same everywhere."""
     spread = table.std(axis=0)
-    return np.asarray(table / np.where(spread > 0, spread, 1.0), dtype=np.float32)
+    return np.asarray(np.where(spread > 0, spread, 1.0))
 
 
 @dataclass(frozen=True, kw_only=True)

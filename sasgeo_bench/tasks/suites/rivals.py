@@ -132,7 +132,7 @@ def field_of(state: State, classes: Sequence[str], prior: Prior, *, reach_m: flo
         row, col = state.grid.to_cells(np.array([prior.center_m]))[0].tolist()
         half = int(np.ceil((prior.radius_m + reach_m) / state.grid.cell_size_m / factor)) * factor
         top, left, rows, cols = row - half, col - half, 2 * half, 2 * half
-    bits = _window(state.bits.bits, top, left, (rows, cols))
+    bits = window(state.bits.bits, top, left, (rows, cols))
     # A cell that the map does not know has none of its classes.
     known = bits >> np.uint32(31) == 0
     layers = [_coarse((bits >> np.uint32(state.classes.index(name)) & 1 > 0) & known, factor) for name in classes]
@@ -140,8 +140,8 @@ def field_of(state: State, classes: Sequence[str], prior: Prior, *, reach_m: flo
     return Field.of(grid=grid, layers=np.stack(layers), known=_coarse(known, factor))
 
 
-def _window(bits: NDArray[np.uint32], top: int, left: int, shape: tuple[int, int]) -> NDArray[np.uint32]:
-    """Cut a window that may reach beyond the map, where nothing is known."""
+def window(bits: NDArray[np.uint32], top: int, left: int, shape: tuple[int, int]) -> NDArray[np.uint32]:
+    """Cut a window of a map's bits that may reach beyond the map, where nothing is known."""
     cut = np.full(shape, 1 << 31, dtype=np.uint32)
     first, start = max(top, 0), max(left, 0)
     last, end = min(top + shape[0], bits.shape[0]), min(left + shape[1], bits.shape[1])

@@ -17,7 +17,6 @@ from sasgeo_bench.tasks.split import Block
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, Site, Suite
 
 _SCALE_CUT: Final = 2.0  # sigmas at which the scales of views are cut
-ANCHOR_SPREAD: Final = 0.2  # largest distance of a site from its anchor, as a fraction of the view's side
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +106,7 @@ class _Ground:
         near = self._near(block)
         if near is not None and len(near) == 0:
             return
-        spread_m, failed = ANCHOR_SPREAD * self.suite.main_side_m, 0
+        spread_m, failed = self.suite.anchor_spread_m, 0
         while failed < 400:  # draws in a block before it counts as full
             point = rng.uniform((west, south), (east, north))
             if near is not None:

@@ -31,7 +31,6 @@ from sasgeo_bench.tasks.suites.base import (
     pair,
 )
 from sasgeo_bench.tasks.suites.mining import min_distance_m
-from sasgeo_bench.tasks.suites.sites import ANCHOR_SPREAD
 from sasgeo_bench.tasks.suites.vectors import site_vectors
 from sasgeo_bench.tasks.twin import ROADS, Change, Paste, level_crossings, open_gaps, split_long, stagger
 from sasgeo_bench.tasks.vectors import instances_of_mask
@@ -498,7 +497,7 @@ class StableNotDistinctive(Suite):
         """Find existing twins, with the same distances from a line and from each other as sites; change no map."""
         places = straight_places(scene)
         spacing_m = min_distance_m(self.main_side_m / 2)
-        spread_m = ANCHOR_SPREAD * self.main_side_m
+        spread_m = self.anchor_spread_m
         twins = {}
         for site in sites:
             rng = seeds.rng("alias", site.index)

@@ -26,6 +26,7 @@ from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.base import Edit, QueryDraft, Scene, Seeds, Site, Suite, Variant, ViewRequest
 from sasgeo_bench.tasks.suites.flights import ChangedMapSuite, FlightImageSuite, changed, changes_of
+from sasgeo_bench.tasks.suites.natural import NATURAL_TWINS
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
 
@@ -47,6 +48,8 @@ TOWN_OF = {
     "alias": "town-agricultural huge",
     "controls": "town-suburb large",
     "telemetry": "town-grid",
+    "natural-twins": "town-grid large",
+    "natural-absent": "town-grid large",
     "flight-real-age": "town-suburb",
     **dict.fromkeys(("flight-clean", "flight-start", "flight-gap", "flight-kidnap"), "town-grid"),
     "flight-overconfident": "town-grid",
@@ -185,13 +188,25 @@ def edited(town) -> Callable[..., State]:
 
 
 @pytest.fixture(scope="session")
-def carried(scene, edited) -> Callable[..., Carried]:
+def alike(scene) -> Callable[[str], Scene]:
+    """A scene with the pairs of its places that look alike, mined once for both suites that ask them."""
+
+    @cache
+    def of_town(where: str) -> Scene:
+        of = scene(where, NATURAL_TWINS.card.name)
+        return replace(of, natural=NATURAL_TWINS.mine(of, None))
+
+    return of_town
+
+
+@pytest.fixture(scope="session")
+def carried(scene, alike, edited) -> Callable[..., Carried]:
     """A suite on the town that can carry it, its edits carried out; at fewer sites for other seeds than the first."""
 
     @cache
     def of_suite(name: str, root: int = 1) -> Carried:
         suite, where = EVERY_SUITE[name], TOWN_OF.get(name, "town-suburb")
-        plain = scene(where, name)
+        plain = alike(where) if "natural twins" in suite.card.needs else scene(where, name)
         assert suite.lack(plain) is None
         suite = replace(suite, variants=suite.usable(plain))
         seeds = Seeds(root=root, names=(plain.map.region, name))
@@ -205,7 +220,7 @@ def carried(scene, edited) -> Callable[..., Carried]:
                 world = edited(where, paste(plain.map.features, edit.world_pastes))
             after = replace(plain, map=changed, world=world)
         if edit is not None:
-            after, sites = replace(after, twins=edit.twins), edit.sites
+            after, sites = replace(after, twins=edit.twins, look_alikes=edit.elsewhere), edit.sites
         assert len(sites) == count
         return Carried(suite=suite, scene=after, plain=plain, sites=sites, seeds=seeds, edit=edit)
 

@@ -234,7 +234,7 @@ def unlikeness(windows: Windows, here: int, others: Windows, far: NDArray[np.int
         table, own = (others.plain[name], windows.plain[name][here]) if name in windows.plain else (None, None)
         if table is None or own is None:
             table, own = others.polar, windows.polar[here]
-        found.append(np.sqrt(((table[far] - own) ** 2).reshape(len(far), -1).sum(axis=1)))
+        found.append(np.sqrt(((table[far] - own) ** 2).sum(axis=tuple(range(1, table.ndim)))))
     return np.stack(found)
 
 

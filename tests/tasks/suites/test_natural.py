@@ -25,6 +25,7 @@ from sasgeo_bench.tasks.suites.natural import (
     STEP,
     align,
     in_order,
+    mine_twins,
     own_likeness,
     pair_of,
 )
@@ -119,6 +120,12 @@ def test_the_order_is_that_of_the_mean_over_scorers_each_over_its_median():
     # medians 3 and 20: means 0.42, 2.5 and 1
     assert in_order(rows, distances) == [(0, 5), (1, 7), (0, 6)]
     assert in_order([], []) == []
+
+
+def test_a_place_without_another_one_within_reach_has_no_twin(alike):
+    scene = alike(TOWN)
+    kwargs = {"side_m": SIDE_M, "clear_m": scene.view_reach_m, "min_density": 0.1}
+    assert mine_twins(scene.map, within_m=2 * scene.view_reach_m + 40, **kwargs) == ()
 
 
 def test_pairs_look_alike_do_not_overlap_and_beat_what_lies_beside_them(alike):

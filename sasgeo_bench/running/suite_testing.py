@@ -157,8 +157,10 @@ class _Kit:
                 return f"{variant.name} has no control with a view of its size"
             for site in self.sites:
                 one, two = self._draft(site, variant, _AsControl), self._draft(site, control)
-                is_seen = one.evidence.cells != UNKNOWN
-                if (one.evidence.cells != two.evidence.cells)[is_seen].any():
+                is_hidden, is_less = one.evidence.cells == UNKNOWN, two.evidence.cells == UNKNOWN
+                if (is_hidden & ~is_less).any() and not (is_less & ~is_hidden).any():
+                    continue  # it sees less, and has errors of its own
+                if (one.evidence.cells != two.evidence.cells).any():
                     return f"{variant.name} shows something else than the control, so that a method may gain on it"
         return None
 

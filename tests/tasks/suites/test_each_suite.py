@@ -102,10 +102,12 @@ def test_the_view_of_a_falsifier_is_that_of_its_control_but_for_the_draw_of_erro
             if variant.kind == ALL_UNKNOWN:
                 assert (draft.evidence.cells == UNKNOWN).all()
                 continue
-            is_seen = (draft.evidence.cells != UNKNOWN) | (name not in NATURAL)
-            np.testing.assert_array_equal(draft.evidence.cells[is_seen], control.evidence.cells[is_seen])
+            if name in NATURAL:  # sees less, with errors of its own
+                assert (draft.evidence.cells == UNKNOWN).mean() > (control.evidence.cells == UNKNOWN).mean()
+                continue
+            np.testing.assert_array_equal(draft.evidence.cells, control.evidence.cells)
             assert draft.group == control.group
-            assert (draft.is_present == control.is_present) == (name != "natural-absent")
+            assert draft.is_present == control.is_present
             assert draft.changed_share == control.changed_share
             if control.vectors is not None:
                 assert same_vectors(draft.vectors, control.vectors)

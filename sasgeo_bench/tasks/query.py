@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
 TWIN_EAST, TWIN_NORTH = "twin_east_m", "twin_north_m"  # measured: offset from a site to its copy
+TWIN_TURN: Final = "twin_turn_deg"  # measured: clockwise, from a heading to that at which the twin looks like it
 CEILING: Final = "ceiling"  # measured: the most that a matcher can expect, where copies leave nothing to tell them by
 UNRIVALLED: Final = "unrivalled"  # begins the kind of a stress whose rival is out of reach: it decides nothing
 COPIES: Final = "twins"  # measured: exact copies of the place among the candidates

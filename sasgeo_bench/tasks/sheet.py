@@ -31,7 +31,7 @@ from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import GROUND, PAINT_ORDER, paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
 from sasgeo_bench.tasks.build import rebuild_hint
-from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, PriorGroup, Query, Truth, flight_id
+from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, TWIN_TURN, PriorGroup, Query, Truth, flight_id
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import changed_share
 from sasgeo_bench.tasks.suites.mining import describe, mine
@@ -44,7 +44,7 @@ ONLY_MAPPED: Final = "#1565c0"
 AGREE: Final = "#d9d9d9"
 TWIN: Final = "map at the twin"
 DECOY: Final = "map at the hardest decoy"
-_OF_TWIN: Final = (TWIN_EAST, TWIN_NORTH, RIVALS, IN_DISC, LISTED, TRUTH_LISTED, LEAD)  # shown in words
+_OF_TWIN: Final = (TWIN_EAST, TWIN_NORTH, TWIN_TURN, RIVALS, IN_DISC, LISTED, TRUTH_LISTED, LEAD)  # shown in words
 _COLUMNS: Final = ("view", "map at the true place", "view against map")
 _CELL_INCHES: Final = 2.4
 _TEXT_INCHES: Final = 3.0  # width of the text column, readable when the sheet is shown smaller
@@ -337,7 +337,8 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple
     if TWIN_EAST in truth.measured:
         easting_m = truth.pose.easting_m + truth.measured[TWIN_EAST]
         northing_m = truth.pose.northing_m + truth.measured[TWIN_NORTH]
-        twin = view(replace(truth.pose, easting_m=easting_m, northing_m=northing_m))
+        yaw_deg = truth.pose.yaw_deg + truth.measured.get(TWIN_TURN, 0.0)
+        twin = view(replace(truth.pose, easting_m=easting_m, northing_m=northing_m, yaw_deg=yaw_deg % 360))
         return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=twin, rival=TWIN)
     near = _others(query, truth) or rivals.get(truth.pose, ())
     places = [(pose.easting_m, pose.northing_m) for pose in near]

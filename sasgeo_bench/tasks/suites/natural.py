@@ -13,7 +13,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sasgeo_bench.regions.evidence import UNKNOWN
-from sasgeo_bench.tasks.query import CEILING, PriorGroup
+from sasgeo_bench.tasks.query import CEILING, TWIN_TURN, PriorGroup
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import (
     Edit,
@@ -355,7 +355,8 @@ class NaturalSuite(Suite):
         return replace(
             draft,
             strength=round(math.ceil(margin / STEP - 1e-6) * STEP, 2),
-            measured={"margin": round(margin, 4), "twin_rank": float(twin.rank), **draft.measured},
+            measured={"margin": round(margin, 4), "twin_rank": float(twin.rank), TWIN_TURN: twin.turn_deg}
+            | draft.measured,
         )
 
     def stress(self, shot: ViewRequest, twin: NaturalTwin, draft: QueryDraft) -> QueryDraft:  # noqa: ARG002

@@ -66,8 +66,8 @@ PAGE: Final = """# Natural twins
 
 Places that look alike and were found on the map, not made; what they are, and how they are asked, stands with the
 [suites](concepts/suite.md#natural-twins). Here are those of the open places of the split
-[`world`](../splits/README.md): **{pairs} pairs in {places} places of {countries} countries** whose views of 96 m do not overlap; {without} of the
-{all} open places have none. Made by
+[`world`](../splits/README.md): **{pairs} pairs in {places} places of {countries} countries** whose views of 96 m do not
+overlap; {without} of the {all} open places have none. Made by
 
 ```bash
 sasgeo-bench build-region --every --out out
@@ -264,7 +264,7 @@ def write(sheet: NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
 def likest(pairs: Sequence[Pair], *, count: int, most: int) -> list[Pair]:
     """Return the likest pairs, at most so many of a place."""
     taken: dict[str, int] = {}
-    found = []
+    found: list[Pair] = []
     for pair in sorted(pairs, key=lambda pair: (pair.margin, pair.region, pair.twin.place_m)):
         if taken.get(pair.place.name, 0) < most and len(found) < count:
             taken[pair.place.name] = taken.get(pair.place.name, 0) + 1

@@ -183,7 +183,7 @@ def test_all_suites_are_listed_with_what_they_separate(program):
     lines = printed.splitlines()
     listed = [line.split()[0] for line in lines[1:] if line.strip()]
     assert listed[: len(EVERY_SUITE)] == list(EVERY_SUITE)  # suites of installed packages follow
-    assert len(SUITES) == 17
+    assert len(SUITES) == 19
     for name, suite in EVERY_SUITE.items():
         line = next(line for line in lines if line.startswith(f"{name} "))
         assert suite.card.title in line

@@ -73,13 +73,13 @@ overlap; {without} of the {all} open places have none. Made by
 sasgeo-bench build-region --every --out out
 python docs/figures/natural_twins.py --out out --mine
 sasgeo-bench make-queries --suite natural-twins --suite natural-absent --split world --seed 0 --n 3 --up-to --skip \
-  --regions duitama --out out      # and all other train places
+  --regions duitama --out out      # and the others
 sasgeo-bench run --matcher sasgeo --tasks out/tasks/natural-twins/* --tasks out/tasks/natural-absent/* --out out
 python docs/figures/natural_twins.py --out out
 ```
 
-with `run` for each of the matchers named below. Queries were drawn at train places alone: {sites} sites of {regions}
-regions.
+with `run` for each of the matchers named below. Queries were drawn at train places alone, on the first region of each
+that has ten pairs or more: {sites} sites of {names}.
 
 (c) OpenStreetMap contributors, ODbL.
 
@@ -410,7 +410,7 @@ def main() -> None:
         absent=absent(asked("natural-absent", out)),
         steps=by_margin(rows),
         sites=len(rows[["region", "spot"]].drop_duplicates()),
-        regions=rows["region"].nunique(),
+        names=", ".join(sorted(rows["region"].unique())),
         shown=len(shown),
         lost=sum(right == 0 for _, right, _ in shown),
         told=TOLD,

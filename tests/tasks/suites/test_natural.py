@@ -12,7 +12,9 @@ import shapely
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN, LayerBits
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.tasks.query import CEILING, PriorGroup
 from sasgeo_bench.tasks.sampling import Drawer
 from sasgeo_bench.tasks.split import find_split
@@ -29,6 +31,7 @@ from sasgeo_bench.tasks.suites.natural import (
     pair_of,
 )
 from sasgeo_bench.tasks.suites.rivals import holds
+from tests.tasks.suites.conftest import MAIN_REACH_M
 
 TOWN = "town-grid large"
 SIDE_M = 96.0
@@ -229,3 +232,15 @@ def test_a_region_without_look_alikes_and_a_disc_too_small_for_two_are_refused(s
     assert "needs a disc that holds two places" in NATURAL_TWINS.refusal(small)
     assert NATURAL_TWINS.refusal(replace(small, radius_m=None)) is None
     assert NATURAL_TWINS.within_m(replace(small, radius_m=2000.0)) == 2000.0
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_a_real_town_with_every_plot_has_look_alikes_and_one_of_single_farms_has_none(tmp_path, real_extracts):
+    for region, least in (("duitama", 20), ("cayococo", 0)):
+        spec = read_region_file(find_region_file(region))
+        plan = plan_build(spec, out=tmp_path, extract_folders=(real_extracts,))
+        build_region(plan)
+        found = mine_twins(State.read(plan.folder), side_m=SIDE_M, clear_m=MAIN_REACH_M / 2, within_m=800.0, min_density=0.1)
+        assert len(found) >= least
+        assert len(found) == 0 or least

@@ -39,7 +39,7 @@ from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.task_plan import Request
 
 SPLIT: Final = "world"
-MATCHERS: Final = ("sasgeo", "schmidt_segcorr", "raster_soft", "fft_vote", "ubev_template", "graph_only")
+MATCHERS: Final = ("sasgeo", "schmidt_segcorr", "raster_soft", "fft_vote", "graph_only")
 DOCS: Final = Path(__file__).parents[1]
 FIGURES: Final = DOCS / "figures"
 MOST: Final = 1000  # more sites than any place here has
@@ -116,7 +116,7 @@ that of the control's views that were found (nothing is thresholded here):
 
 ## Forty to judge by eye
 
-Drawn by the suite at train places, over all margins. Below each pair: number, region, margin, and how many of the six
+Drawn by the suite at train places, over all margins. Below each pair: number, region, margin, and how many of the five
 matchers found the place.
 
 ![Forty pairs with what differs marked](figures/twins-asked.webp)
@@ -384,7 +384,7 @@ def main() -> None:
     names = [f"{pair.region[:14]} {pair.margin:.2f}" for pair in alike]
     cv2.imwrite(str(FIGURES / "twins-mined.webp"), sheet_of(alike, names, out, side=64, across=10), WEBP)
     names = [
-        f"{at}: {pair.region[:20]} {pair.margin:.2f}, {right} of 6" for at, (pair, right, _) in enumerate(shown, 1)
+        f"{at}: {pair.region[:20]} {pair.margin:.2f}, {right} of 5" for at, (pair, right, _) in enumerate(shown, 1)
     ]
     sheet = sheet_of([pair for pair, _, _ in shown], names, out, side=128, across=5)
     cv2.imwrite(str(FIGURES / "twins-asked.webp"), sheet, WEBP)

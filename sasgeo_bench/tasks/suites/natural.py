@@ -48,7 +48,7 @@ _KEPT: Final = 120  # sites are drawn from these
 _HOPELESS: Final = LEAST_LIKENESS - 0.15  # in coarse cells: finer ones add 0.1 at most
 _TIED: Final = 0.01  # the tolerance leaves shifts equal that are not
 _REACH_M: Final = 24.0  # the lattice is 32 m wide, so a twin lies at most 23 m beside a point of it
-_OWN_REACH_M: Final = 48.0
+_OWN_REACH_M: Final = 2 * _REACH_M
 _TURNS_DEG: Final = (-12.0, -8.0, -4.0, 0.0, 4.0, 8.0, 12.0)  # within what a weak heading leaves open
 _FINE_TURNS_DEG: Final = (-2.0, 0.0, 2.0)
 

@@ -6,9 +6,9 @@
     .venv/bin/python benchmarks/open_numbers.py --table docs/results/open-numbers.csv
 
 The first command draws views of a train place of each train country (split `trials`, suite `clean` with three times the
-error of perception), asks each system of ours about them with each of its settings, six at most, and writes each
+error of perception, a disc of 250 m), asks each system of ours about them with each of its settings, six at most, and writes each
 answer, then `trials.csv`, into the folder; it resumes. The second does so for a matcher of yours, which is a `Tunable`.
-What learns is asked about half of the places after learning from the views of the other half.
+What learns is asked about half of the places after learning from two places of the other half.
 
 The rule: of the settings that are not in use the best one is that which finds most views within 25 m, of several that
 whose median error is less, no answer counting as the radius of the search, of several of these the first. It takes the
@@ -44,12 +44,13 @@ from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 
 SPLIT, SUITE, KIND, STRENGTH = "trials", "clean", "perception", 3.0
-SITES, SEED = 2, 90
+PRIOR = "r250-weak-s3"  # half the usual radius: trials of all settings cost half then
+SITES, SEED, LESSONS = 2, 90, 2
 VIEW_M, RIGHT_M = 192.0, 25.0
 HEAD: Final = ("system", "setting", "was_used", "views", "median_m", "view_s")  # of trials; a column a place follows
 ANSWER: Final = ("system", "setting", "place", "error_m", "view_s")
 
-Asked = dict[str, list[tuple[sgb.Query, sgb.Truth]]]  # by place
+Views = dict[str, list[tuple[sgb.Query, sgb.Truth]]]  # by place
 
 
 class TunedSasgeo(Tunable, Sasgeo):
@@ -138,28 +139,29 @@ def systems(names: Sequence[str] = ()) -> dict[str, type[Tunable]]:
     return dict(sorted((name, kind) for name, kind in found.items() if name in names or not names))
 
 
-def drawn(out: Path) -> Asked:
-    """Draw the views, and return them by place with their truths."""
-    sgb.make_tasks(suite=[SUITE], regions=list(places()), split=SPLIT, n=SITES, seed=SEED, out=out)
-    found: Asked = {}
+def drawn(out: Path) -> Views:
+    """Draw the views with any error of perception, and return them by place with their truths."""
+    sgb.make_tasks(suite=[SUITE], regions=list(places()), split=SPLIT, n=SITES, seed=SEED, prior=PRIOR, out=out)
+    found: Views = {}
     for place in places():
         truths = {truth.query_id: truth for truth in sgb.read_truths(out / "truth" / SUITE / place)}
         for query in sgb.read_queries(out / "tasks" / SUITE / place):
             truth = truths[query.query_id]
-            is_asked = query.track == "localization" and (truth.kind, truth.strength) == (KIND, STRENGTH)
-            if is_asked and round(max(query.evidence.size_m)) == VIEW_M:
+            if query.track == "localization" and truth.kind == KIND and round(max(query.evidence.size_m)) == VIEW_M:
                 found.setdefault(place, []).append((query, truth))
     return found
 
 
-def answers(out: Path, asked: Asked, place: str, system: str, kind: type[Tunable], setting: str) -> list[Answer]:
+def answers(out: Path, views: Views, place: str, system: str, kind: type[Tunable], setting: str) -> list[Answer]:
     """Ask a system with one setting about the views of a place."""
     region = sgb.read_region(out / "regions" / place, with_layers=False)
     numbers = json.loads(setting)
     matcher: Any = kind(**numbers)
-    matcher.prepare(region, _learned(out, asked, place, system, kind, setting))
+    matcher.prepare(region, _learned(out, views, place, system, kind, setting))
     found = []
-    for query, truth in asked[place]:
+    for query, truth in views[place]:
+        if truth.strength != STRENGTH:
+            continue
         start = time.process_time()
         poses = matcher.match(query, top_k=1).poses
         taken_s = round(time.process_time() - start, 3)
@@ -168,17 +170,17 @@ def answers(out: Path, asked: Asked, place: str, system: str, kind: type[Tunable
     return found
 
 
-def _learned(out: Path, asked: Asked, place: str, system: str, kind: type[Tunable], setting: str) -> str | None:
-    """Return what a system learns from the half that a place is not in; it is learned once, and stored."""
+def _learned(out: Path, views: Views, place: str, system: str, kind: type[Tunable], setting: str) -> str | None:
+    """Return what a system learns from the last places of the half that a place is not in; learned once, and stored."""
     matcher: Any = kind(**json.loads(setting))
     if not isinstance(matcher, sgb.Learner):
         return None
     half_of = places()
     path = out / "learned" / f"{system}-{hashlib.sha256(setting.encode()).hexdigest()[:8]}-not-{half_of[place]}.txt"
     if not path.exists():
-        others = [name for name in asked if half_of[name] != half_of[place]]
+        others = [name for name in views if half_of[name] != half_of[place]][-LESSONS:]
         regions = {name: sgb.read_region(out / "regions" / name, with_layers=False) for name in others}
-        text = matcher.learn(sgb.Training(regions=regions, pairs=list(chain(*(asked[name] for name in others)))))
+        text = matcher.learn(sgb.Training(regions=regions, pairs=list(chain(*(views[name] for name in others)))))
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     return path.read_text(encoding="utf-8")
@@ -362,21 +364,23 @@ def try_all(out: Path, asked_now: dict[str, type[Tunable]], *, jobs: int) -> Non
     """
     path = out / "answers.csv"
     found = read_answers(path)  # a file that is none is told before anything is drawn
-    asked = drawn(out)
+    views = drawn(out)
     done = {(one.place, one.system, one.setting) for one in found}
     todo = [
         (place, name, kind, json.dumps(numbers))
-        for place in asked
+        for place in views
         for name, kind in asked_now.items()
         for numbers in kind.settings()
         if (place, name, json.dumps(numbers)) not in done
     ]
     print(f"{counted(len(done), 'setting at a place', 'settings at places')} there, {len(todo)} to ask", flush=True)
+    ask = partial(_asked_or_told, out, views)
     with ProcessPoolExecutor(jobs) as pool, path.open("a", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         if not found:
             table.writerow(ANSWER)
-        for item in pool.map(partial(_asked_or_told, out, asked), *zip(*todo, strict=True)) if todo else ():
+        spread = pool.map if jobs > 1 else map
+        for item in spread(ask, *zip(*todo, strict=True)) if todo else ():
             if isinstance(item, str):
                 print(item)
                 continue
@@ -384,7 +388,7 @@ def try_all(out: Path, asked_now: dict[str, type[Tunable]], *, jobs: int) -> Non
             table.writerows([getattr(one, name) for name in ANSWER] for one in item)
             file.flush()
     known = systems() | asked_now
-    trials = trials_of(found, known, list(asked))
+    trials = trials_of(found, known, list(views))
     if trials:
         write_trials(out / "trials.csv", trials)
     whole = {name: own for name, own in _by_system(trials).items() if len(own) == len(known[name].settings())}
@@ -392,11 +396,11 @@ def try_all(out: Path, asked_now: dict[str, type[Tunable]], *, jobs: int) -> Non
 
 
 def _asked_or_told(
-    out: Path, asked: Asked, place: str, system: str, kind: type[Tunable], setting: str
+    out: Path, views: Views, place: str, system: str, kind: type[Tunable], setting: str
 ) -> list[Answer] | str:
     """Return answers, or a line that says why there are none."""
     try:
-        return answers(out, asked, place, system, kind, setting)
+        return answers(out, views, place, system, kind, setting)
     except Exception as error:  # noqa: BLE001 - whatever a contestant does
         return one_line(f"{system} {setting} at {place}: no answer ({type(error).__name__}: {error})")
 

@@ -5,8 +5,8 @@
     .venv/bin/python benchmarks/open_numbers.py --out out/open-numbers --matcher my-matcher
     .venv/bin/python benchmarks/open_numbers.py --table docs/results/open-numbers.csv
 
-The first command draws views of a train place of each train country (split `trials`, suite `clean` with three times the
-error of perception, a disc of 250 m), asks each system of ours about them with each of its settings, six at most, and writes each
+The first command draws views of a train place of each train country (split `trials`, suite `clean` with two and four times
+the error of perception, a disc of 250 m), asks each system of ours about them with each of its settings, six at most, and writes each
 answer, then `trials.csv`, into the folder; it resumes. The second does so for a matcher of yours, which is a `Tunable`.
 What learns is asked about half of the places after learning from two places of the other half.
 
@@ -26,9 +26,9 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from importlib.metadata import entry_points
-from itertools import chain, groupby
+from itertools import chain, groupby, product
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,19 +38,24 @@ from sasgeo_baselines.tunable import Tunable
 import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import MatchError, SasgeoError, StoreError, counted
 from sasgeo_bench.core.texts import NAME, one_line
+from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.variants import Sasgeo
 from sasgeo_bench.scoring.intervals import ClusterDraws, Interval, mean_interval
 from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 
-SPLIT, SUITE, KIND, STRENGTH = "trials", "clean", "perception", 3.0
-PRIOR = "r250-weak-s3"  # half the usual radius: trials of all settings cost half then
-SITES, SEED, LESSONS = 2, 90, 2
+SPLIT = "trials"
+ASKED = {"clean": ("perception", (2.0, 4.0))}  # by suite: kind and strengths of the views
+# What bounds the time: half the usual radius, no more of a map than a view and its disc need, and one site a place. The
+# second site is learned from alone.
+PRIOR, AROUND_M = "r250-weak-s3", 650.0
+SITES, SEED = 2, 90
+LESSONS = 2  # places of the other half that are learned from
 VIEW_M, RIGHT_M = 192.0, 25.0
 HEAD: Final = ("system", "setting", "was_used", "views", "median_m", "view_s")  # of trials; a column a place follows
 ANSWER: Final = ("system", "setting", "place", "error_m", "view_s")
 
-Views = dict[str, list[tuple[sgb.Query, sgb.Truth]]]  # by place
+Pairs = list[tuple[sgb.Query, sgb.Truth]]
 
 
 class TunedSasgeo(Tunable, Sasgeo):
@@ -62,6 +67,15 @@ class TunedSasgeo(Tunable, Sasgeo):
     def __init__(self, **numbers: float) -> None:
         super().__init__(**numbers)
         Sasgeo.__init__(self, Plan(cells=int(self.numbers["cells"])))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Views:
+    """Views by place, with their truths: those that are asked, and those of the same kinds that may be learned from."""
+
+    out: Path
+    asked: Mapping[str, Pairs]
+    lessons: Mapping[str, Pairs]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,29 +153,36 @@ def systems(names: Sequence[str] = ()) -> dict[str, type[Tunable]]:
     return dict(sorted((name, kind) for name, kind in found.items() if name in names or not names))
 
 
-def drawn(out: Path) -> Views:
-    """Draw the views with any error of perception, and return them by place with their truths."""
-    sgb.make_tasks(suite=[SUITE], regions=list(places()), split=SPLIT, n=SITES, seed=SEED, prior=PRIOR, out=out)
-    found: Views = {}
-    for place in places():
-        truths = {truth.query_id: truth for truth in sgb.read_truths(out / "truth" / SUITE / place)}
-        for query in sgb.read_queries(out / "tasks" / SUITE / place):
+def drawn(out: Path, kinds: Mapping[str, tuple[str, tuple[float, ...]]] = ASKED) -> Views:
+    """Draw the views of some suites; `kinds` are those that are asked, each with its strengths."""
+    sgb.make_tasks(suite=list(kinds), regions=list(places()), split=SPLIT, n=SITES, seed=SEED, prior=PRIOR, out=out)
+    asked: dict[str, Pairs] = {}
+    lessons: dict[str, Pairs] = {place: [] for place in places()}
+    for place, (suite, (kind, strengths)) in product(places(), kinds.items()):
+        truths = {truth.query_id: truth for truth in sgb.read_truths(out / "truth" / suite / place)}
+        for query in sgb.read_queries(out / "tasks" / suite / place):
             truth = truths[query.query_id]
-            if query.track == "localization" and truth.kind == KIND and round(max(query.evidence.size_m)) == VIEW_M:
-                found.setdefault(place, []).append((query, truth))
-    return found
+            is_right_size = query.track == "localization" and round(max(query.evidence.size_m)) == VIEW_M
+            if is_right_size and truth.kind == kind:
+                lessons[place].append((query, truth))
+    for place, pairs in lessons.items():
+        site = pairs[0][1].pose
+        asked[place] = [
+            (query, truth)
+            for query, truth in pairs
+            if truth.pose == site and truth.strength in dict(kinds.values())[truth.kind]
+        ]
+    return Views(out=out, asked=asked, lessons=lessons)
 
 
-def answers(out: Path, views: Views, place: str, system: str, kind: type[Tunable], setting: str) -> list[Answer]:
+def answers(views: Views, place: str, system: str, kind: type[Tunable], setting: str) -> list[Answer]:
     """Ask a system with one setting about the views of a place."""
-    region = sgb.read_region(out / "regions" / place, with_layers=False)
-    numbers = json.loads(setting)
-    matcher: Any = kind(**numbers)
-    matcher.prepare(region, _learned(out, views, place, system, kind, setting))
+    matcher: Any = kind(**json.loads(setting))
+    folder, at = views.out / "regions" / place, views.asked[place][0][1].pose
+    region = _read(folder) if at is None else _around(folder, at.easting_m, at.northing_m)
+    matcher.prepare(region, _learned(views, place, system, kind, setting))
     found = []
-    for query, truth in views[place]:
-        if truth.strength != STRENGTH:
-            continue
+    for query, truth in views.asked[place]:
         start = time.process_time()
         poses = matcher.match(query, top_k=1).poses
         taken_s = round(time.process_time() - start, 3)
@@ -170,20 +191,35 @@ def answers(out: Path, views: Views, place: str, system: str, kind: type[Tunable
     return found
 
 
-def _learned(out: Path, views: Views, place: str, system: str, kind: type[Tunable], setting: str) -> str | None:
+def _learned(views: Views, place: str, system: str, kind: type[Tunable], setting: str) -> str | None:
     """Return what a system learns from the last places of the half that a place is not in; learned once, and stored."""
     matcher: Any = kind(**json.loads(setting))
     if not isinstance(matcher, sgb.Learner):
         return None
     half_of = places()
-    path = out / "learned" / f"{system}-{hashlib.sha256(setting.encode()).hexdigest()[:8]}-not-{half_of[place]}.txt"
+    of_setting = hashlib.sha256(setting.encode()).hexdigest()[:8]
+    path = views.out / "learned" / f"{system}-{of_setting}-not-{half_of[place]}.txt"
     if not path.exists():
-        others = [name for name in views if half_of[name] != half_of[place]][-LESSONS:]
-        regions = {name: sgb.read_region(out / "regions" / name, with_layers=False) for name in others}
-        text = matcher.learn(sgb.Training(regions=regions, pairs=list(chain(*(views[name] for name in others)))))
+        others = [name for name in views.lessons if half_of[name] != half_of[place]][-LESSONS:]
+        regions = {name: _read(views.out / "regions" / name) for name in others}
+        pairs = list(chain(*(views.lessons[name] for name in others)))
+        text = matcher.learn(sgb.Training(regions=regions, pairs=pairs))
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
     return path.read_text(encoding="utf-8")
+
+
+@lru_cache(maxsize=LESSONS)
+def _read(folder: Path) -> sgb.Region:
+    """Return a region, kept for the next setting: to read it takes longer than to answer."""
+    return sgb.read_region(folder, with_layers=False)
+
+
+@lru_cache(maxsize=1)
+def _around(folder: Path, east_m: float, north_m: float) -> sgb.Region:
+    """Return the part of a region around a place."""
+    reach_m = AROUND_M
+    return read_region(folder, bounds_m=(east_m - reach_m, north_m - reach_m, east_m + reach_m, north_m + reach_m))
 
 
 def _error_m(poses: Sequence[sgb.Pose], query: sgb.Query, truth: sgb.Truth) -> float:
@@ -362,45 +398,51 @@ def try_all(out: Path, asked_now: dict[str, type[Tunable]], *, jobs: int) -> Non
 
     A system that fails costs its own trials alone.
     """
-    path = out / "answers.csv"
-    found = read_answers(path)  # a file that is none is told before anything is drawn
+    there = read_answers(out / "answers.csv")  # a file that is none is told before anything is drawn
     views = drawn(out)
-    done = {(one.place, one.system, one.setting) for one in found}
-    todo = [
-        (place, name, kind, json.dumps(numbers))
-        for place in views
-        for name, kind in asked_now.items()
-        for numbers in kind.settings()
-        if (place, name, json.dumps(numbers)) not in done
-    ]
-    print(f"{counted(len(done), 'setting at a place', 'settings at places')} there, {len(todo)} to ask", flush=True)
-    ask = partial(_asked_or_told, out, views)
-    with ProcessPoolExecutor(jobs) as pool, path.open("a", encoding="utf-8", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        if not found:
-            table.writerow(ANSWER)
-        spread = pool.map if jobs > 1 else map
-        for item in spread(ask, *zip(*todo, strict=True)) if todo else ():
-            if isinstance(item, str):
-                print(item)
-                continue
-            found.extend(item)
-            table.writerows([getattr(one, name) for name in ANSWER] for one in item)
-            file.flush()
+    found = ask_all(views, asked_now, there, jobs=jobs)
     known = systems() | asked_now
-    trials = trials_of(found, known, list(views))
+    trials = trials_of(found, known, list(views.asked))
     if trials:
         write_trials(out / "trials.csv", trials)
     whole = {name: own for name, own in _by_system(trials).items() if len(own) == len(known[name].settings())}
     print(*lines([trial for name, own in whole.items() if name in asked_now for trial in own]), sep="\n")
 
 
-def _asked_or_told(
-    out: Path, views: Views, place: str, system: str, kind: type[Tunable], setting: str
-) -> list[Answer] | str:
+def ask_all(
+    views: Views, asked_now: Mapping[str, type[Tunable]], there: Sequence[Answer], *, jobs: int
+) -> list[Answer]:
+    """Return the answers that are there with all others, which are stored as they come; say what gave none."""
+    found = list(there)
+    done = {(one.place, one.system, one.setting) for one in found}
+    todo = [
+        (place, name, kind, json.dumps(numbers))
+        for place in views.asked
+        for name, kind in asked_now.items()
+        for numbers in kind.settings()
+        if (place, name, json.dumps(numbers)) not in done
+    ]
+    print(f"{counted(len(done), 'setting at a place', 'settings at places')} there, {len(todo)} to ask", flush=True)
+    path = views.out / "answers.csv"
+    with ProcessPoolExecutor(jobs) as pool, path.open("a", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        if not found:
+            table.writerow(ANSWER)
+        spread = pool.map if jobs > 1 else map
+        for item in spread(partial(_asked_or_told, views), *zip(*todo, strict=True)) if todo else ():
+            if isinstance(item, str):
+                print(item)
+                continue
+            found.extend(item)
+            table.writerows([getattr(one, name) for name in ANSWER] for one in item)
+            file.flush()
+    return found
+
+
+def _asked_or_told(views: Views, place: str, system: str, kind: type[Tunable], setting: str) -> list[Answer] | str:
     """Return answers, or a line that says why there are none."""
     try:
-        return answers(out, views, place, system, kind, setting)
+        return answers(views, place, system, kind, setting)
     except Exception as error:  # noqa: BLE001 - whatever a contestant does
         return one_line(f"{system} {setting} at {place}: no answer ({type(error).__name__}: {error})")
 

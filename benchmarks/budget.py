@@ -115,9 +115,11 @@ def drawn(out: Path) -> list[sgb.Query]:
     found = []
     for suite, kind in SUITES.items():
         asked = {one.query_id for one in sgb.read_truths(out / "truth" / suite / PLACE) if one.kind == kind}
-        for query in sgb.read_queries(out / "tasks" / suite / PLACE):
-            if query.query_id in asked and query.track == "localization" and max(query.evidence.size_m) == SIDE_M:
-                found.append(query)
+        found.extend(
+            query
+            for query in sgb.read_queries(out / "tasks" / suite / PLACE)
+            if query.query_id in asked and query.track == "localization" and max(query.evidence.size_m) == SIDE_M
+        )
     return found
 
 

@@ -5,10 +5,10 @@
     .venv/bin/python benchmarks/open_numbers.py --out out/open-numbers --matcher my-matcher
     .venv/bin/python benchmarks/open_numbers.py --table docs/results/open-numbers.csv
 
-The first command draws views of a train place of each train country (split `trials`, suite `clean` with two and four times
-the error of perception, a disc of 250 m), asks each system of ours about them with each of its settings, six at most, and writes each
-answer, then `trials.csv`, into the folder; it resumes. The second does so for a matcher of yours, which is a `Tunable`.
-What learns is asked about half of the places after learning from two places of the other half.
+The first command draws views of a train place of each train country (split `trials`, suite `clean` with two and four
+times the error of perception, a disc of 250 m), asks each system of ours about them with each of its settings, six at
+most, and writes each answer, then `trials.csv`, into the folder; it resumes. The second does so for a matcher of yours,
+which is a `Tunable`. What learns is asked about half of the places after learning from two places of the other half.
 
 The rule: of the settings that are not in use the best one is that which finds most views within 25 m, of several that
 whose median error is less, no answer counting as the radius of the search, of several of these the first. It takes the
@@ -156,30 +156,26 @@ def systems(names: Sequence[str] = ()) -> dict[str, type[Tunable]]:
 def drawn(out: Path, kinds: Mapping[str, tuple[str, tuple[float, ...]]] = ASKED) -> Views:
     """Draw the views of some suites; `kinds` are those that are asked, each with its strengths."""
     sgb.make_tasks(suite=list(kinds), regions=list(places()), split=SPLIT, n=SITES, seed=SEED, prior=PRIOR, out=out)
-    asked: dict[str, Pairs] = {}
+    asked: dict[str, Pairs] = {place: [] for place in places()}
     lessons: dict[str, Pairs] = {place: [] for place in places()}
     for place, (suite, (kind, strengths)) in product(places(), kinds.items()):
         truths = {truth.query_id: truth for truth in sgb.read_truths(out / "truth" / suite / place)}
-        for query in sgb.read_queries(out / "tasks" / suite / place):
-            truth = truths[query.query_id]
-            is_right_size = query.track == "localization" and round(max(query.evidence.size_m)) == VIEW_M
-            if is_right_size and truth.kind == kind:
-                lessons[place].append((query, truth))
-    for place, pairs in lessons.items():
-        site = pairs[0][1].pose
-        asked[place] = [
-            (query, truth)
-            for query, truth in pairs
-            if truth.pose == site and truth.strength in dict(kinds.values())[truth.kind]
+        own = [
+            (query, truths[query.query_id])
+            for query in sgb.read_queries(out / "tasks" / suite / place)
+            if query.track == "localization" and round(max(query.evidence.size_m)) == VIEW_M
         ]
+        own = [(query, truth) for query, truth in own if truth.kind == kind]
+        lessons[place] += own
+        asked[place] += [pair for pair in own if pair[1].pose == own[0][1].pose and pair[1].strength in strengths]
     return Views(out=out, asked=asked, lessons=lessons)
 
 
 def answers(views: Views, place: str, system: str, kind: type[Tunable], setting: str) -> list[Answer]:
     """Ask a system with one setting about the views of a place."""
     matcher: Any = kind(**json.loads(setting))
-    folder, at = views.out / "regions" / place, views.asked[place][0][1].pose
-    region = _read(folder) if at is None else _around(folder, at.easting_m, at.northing_m)
+    poses = [truth.pose for _, truth in views.asked[place] if truth.pose is not None]
+    region = _around(views.out / "regions" / place, tuple((pose.easting_m, pose.northing_m) for pose in poses))
     matcher.prepare(region, _learned(views, place, system, kind, setting))
     found = []
     for query, truth in views.asked[place]:
@@ -216,10 +212,10 @@ def _read(folder: Path) -> sgb.Region:
 
 
 @lru_cache(maxsize=1)
-def _around(folder: Path, east_m: float, north_m: float) -> sgb.Region:
-    """Return the part of a region around a place."""
-    reach_m = AROUND_M
-    return read_region(folder, bounds_m=(east_m - reach_m, north_m - reach_m, east_m + reach_m, north_m + reach_m))
+def _around(folder: Path, places_m: tuple[tuple[float, float], ...]) -> sgb.Region:
+    """Return the part of a region around some places."""
+    (west_m, south_m), (east_m, north_m) = np.min(places_m, axis=0) - AROUND_M, np.max(places_m, axis=0) + AROUND_M
+    return read_region(folder, bounds_m=(west_m, south_m, east_m, north_m))
 
 
 def _error_m(poses: Sequence[sgb.Pose], query: sgb.Query, truth: sgb.Truth) -> float:
@@ -334,9 +330,7 @@ def write_trials(path: Path, trials: Sequence[Trial]) -> None:
         table.writerow([*HEAD, *trials[0].right_of])
         for one in trials:
             used = "yes" if one.was_used else ""
-            table.writerow(
-                [one.system, one.setting, used, one.views, one.median_m, one.view_s, *one.right_of.values()]
-            )
+            table.writerow([one.system, one.setting, used, one.views, one.median_m, one.view_s, *one.right_of.values()])
 
 
 def lines(trials: Sequence[Trial]) -> Iterator[str]:

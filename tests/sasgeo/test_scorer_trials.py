@@ -31,7 +31,7 @@ def test_a_setting_does_what_it_says_and_leaves_the_rest_as_it_was(monkeypatch):
     monkeypatch.setattr(Sasgeo, "match", lambda *_, **__: seen.update(level_m=raster.LEVEL_M, bound=raster.REPEATED))
     scorer_trials.TriedSasgeo(level_m=8.0).match(None, top_k=1)
     assert seen == {"level_m": 8.0, "bound": scorer_trials.STANDS["repeated"]}
-    assert raster.LEVEL_M == scorer_trials.STANDS["level_m"]
+    assert scorer_trials.STANDS["level_m"] == raster.LEVEL_M
     assert not scorer_trials.TriedSasgeo(has_graph=0.0).switches.has_graph
     assert scorer_trials.TriedSasgeo(is_fitted=0.0).switches.weights == "even"
     assert scorer_trials.TriedSasgeo(beam=160.0).plan.beam == (160, 48, 20, 12, 10)

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each system costs on a small computer: one core, 2 GB, views of 192 m, a disc of 500 m.
 
-    .venv/bin/python benchmarks/budget.py --out out/open-numbers --matcher schmidt_segcorr --matcher sasgeo
+    .venv/bin/python benchmarks/budget.py --out out/budget --matcher schmidt_segcorr --matcher sasgeo
 
 Prints a table in Markdown: seconds to index a map, what the index takes of memory for each km2, the largest memory of
 the process, the seconds of an answer by the clock (median and 95 %) and of the processor, and the energy of an answer
 where the machine counts it (all of its package, so that a machine with other work says too much); else "-". Systems are
 untaught: what is learned changes no cost; one that cannot answer without training is not measured. Without --matcher
-all systems with open numbers are measured. Views are those of
-`open_numbers.py`.
+all systems with open numbers are measured. Views are clean ones with errors of perception, and ones with a tilt.
 """
 
 import argparse
@@ -20,14 +19,15 @@ from pathlib import Path
 import numpy as np
 
 import sasgeo_bench as sgb
-from benchmarks.open_numbers import drawn, systems
+from benchmarks.open_numbers import systems
 from sasgeo_bench.core.errors import MatchError, SasgeoError
 from sasgeo_bench.core.plugins import MATCHERS, check_names, list_entry_points
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.task_files import query_bytes
 
-PLACE = "vaduz"
-ASKED = 12
+PLACE, SIDE_M = "vaduz", 192.0
+SUITES = {"clean": "perception", "local-warp": "G1 tilt"}  # each with the kind of its views
+SITES, SEED, ASKED = 2, 90, 12
 LIMITS = Limits(match_s=120.0, memory_bytes=2 * 10**9)
 COUNTERS = Path("/sys/class/powercap")
 HEAD = (
@@ -100,13 +100,27 @@ def lines(costs: dict[str, Cost], km2: float) -> Iterator[str]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("out/open-numbers"), help="folder of maps and views")
+    parser.add_argument("--out", type=Path, default=Path("out/budget"), help="folder of maps and views")
     parser.add_argument("--matcher", action="append", default=[], help="name from list matchers; may be repeated")
     options = parser.parse_args()
     try:
         measure(options.out, options.matcher or list(systems()))
     except SasgeoError as error:
         parser.error(str(error))
+
+
+def drawn(out: Path) -> list[sgb.Query]:
+    """Draw the views that are asked."""
+    sgb.make_tasks(suite=list(SUITES), regions=PLACE, n=SITES, seed=SEED, out=out)
+    found = []
+    for suite, kind in SUITES.items():
+        asked = {one.query_id for one in sgb.read_truths(out / "truth" / suite / PLACE) if one.kind == kind}
+        found.extend(
+            query
+            for query in sgb.read_queries(out / "tasks" / suite / PLACE)
+            if query.query_id in asked and query.track == "localization" and max(query.evidence.size_m) == SIDE_M
+        )
+    return found
 
 
 def measure(out: Path, names: list[str]) -> None:
@@ -118,7 +132,7 @@ def measure(out: Path, names: list[str]) -> None:
             f"{stray} is not among the matchers of list matchers: name one of these, no tracker or module:Class"
         )
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
-    blobs = [query_bytes(query) for query, _ in drawn(out)[PLACE][:ASKED]]
+    blobs = [query_bytes(query) for query in drawn(out)[:ASKED]]
     region = out / "regions" / PLACE
     west_m, south_m, east_m, north_m = sgb.read_region(region, with_layers=False).grid.bounds_m
     km2 = (east_m - west_m) * (north_m - south_m) / 1e6

@@ -241,6 +241,8 @@ def test_a_real_town_with_every_plot_has_look_alikes_and_one_of_single_farms_has
         spec = read_region_file(find_region_file(region))
         plan = plan_build(spec, out=tmp_path, extract_folders=(real_extracts,))
         build_region(plan)
-        found = mine_twins(State.read(plan.folder), side_m=SIDE_M, clear_m=MAIN_REACH_M / 2, within_m=800.0, min_density=0.1)
+        found = mine_twins(
+            State.read(plan.folder), side_m=SIDE_M, clear_m=MAIN_REACH_M / 2, within_m=800.0, min_density=0.1
+        )
         assert len(found) >= least
         assert len(found) == 0 or least

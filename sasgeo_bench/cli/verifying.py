@@ -20,7 +20,7 @@ from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running.prediction_files import Violation, parts_of
 from sasgeo_bench.scoring.submission_files import count_excluded, is_submission, validate
 from sasgeo_bench.tasks.build import check_task
-from sasgeo_bench.tasks.duplicates import constellations, search_split
+from sasgeo_bench.tasks.duplicates import BLOCK, Arrangements, constellations, search_look_alikes, search_split
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.task_files import Task
 
@@ -129,9 +129,15 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
         )
     with shown_progress():
         read = spread(lambda name: read_features(out / "regions" / name), built, label="regions read")
-        maps = dict(zip(built, map(constellations, read), strict=True))
+        described = [(constellations(features), Arrangements.of(features)) for features in read]
+    maps, blocks = (dict(zip(built, side, strict=True)) for side in zip(*described, strict=True))
     faults = [
         f"{item.first} and {item.second} of different parts hold the same ground: {item.count} buildings lie alike"
         for item in search_split(split, maps)
+    ] + [
+        f"{item.first} and {item.second} of different parts look alike: {counted(item.count, 'pair')} of blocks of "
+        f"{BLOCK} buildings"
+        for item in search_look_alikes(split, blocks)
     ]
-    return faults, f"no two parts share ground, {counted(len(built), 'region')} searched"
+    searched = f"{counted(len(built), 'region')} and {sum(map(len, blocks.values()))} blocks of {BLOCK} buildings"
+    return faults, f"no two parts share ground or look alike, {searched} searched"

@@ -198,6 +198,7 @@ def _merged(outlines: NDArray[np.object_], ids: Numbers) -> tuple[NDArray[np.obj
     first = np.full(len(grown), len(outlines))
     np.minimum.at(first, body, member)
     order = np.argsort(first, kind="stable")
+    order = order[first[order] < len(outlines)]  # an outline that crosses itself leaves slivers
     return shapely.buffer(grown[order], -half_m, join_style="mitre", mitre_limit=2.0), ids[first[order]]
 
 

@@ -148,7 +148,8 @@ def share_ground(
 def _read_land(path: Path, grid: Grid, *, at: dt.date | None) -> dict[str, NDArray[np.object_]]:
     """Return the areas of `_TAGS` that reach into a grid, in its CRS."""
     wanted = osmium.filter.TagFilter(*(tag for tags in _TAGS.values() for tag in tags))
-    box, found = lonlat_box(grid), {kind: [] for kind in _TAGS}
+    box = lonlat_box(grid)
+    found: dict[str, list[bytes]] = {kind: [] for kind in _TAGS}
     with open_snapshot(path, at=at) as snapshot:
         areas = osmium.FileProcessor(str(snapshot.path)).with_areas(wanted)
         for area in elements(areas.with_filter(osmium.filter.EntityFilter(osmium.osm.AREA)).with_filter(wanted)):

@@ -12,7 +12,7 @@ from sasgeo_bench.boards.run_cases import is_run
 from sasgeo_bench.cli.console import EXIT_USER, complain, say, shown_progress
 from sasgeo_bench.cli.options import Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
-from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.errors import ConfigError, counted, named
 from sasgeo_bench.core.progress import spread, tell
 from sasgeo_bench.exchange.submissions import hold_submission
 from sasgeo_bench.regions.region_files import differing_files, read_features
@@ -122,7 +122,7 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
     built = [region for region in split.spec.region_ids if (out / "regions" / region).is_dir()]
     missing = [region for region in split.spec.region_ids if region not in built]
     if missing:
-        tell(f"not searched, for not built: {', '.join(missing)}")
+        tell(f"not searched, for not built: {named(missing, 'region')}")
     if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:
         raise ConfigError(
             f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"

@@ -30,6 +30,7 @@ _M_PER_DEG: Final = 111_320.0
 Scene = Literal[
     "urban",
     "suburban",
+    "rural",
     "industrial",
     "riverside",
     "agricultural",

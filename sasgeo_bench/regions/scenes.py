@@ -21,7 +21,7 @@ from sasgeo_bench.osm.snapshot import elements, open_snapshot
 from sasgeo_bench.regions.region_spec import Scene
 
 URBAN: Final = 0.15  # shares of the mapped ground: under buildings
-SUBURBAN: Final = 0.03
+SUBURBAN: Final = 0.03  # with less a region is rural
 FIELDS: Final = 0.15
 WATER: Final = 0.02
 SHORE: Final = 0.15  # under water, where less than `SUBURBAN` is under buildings
@@ -52,17 +52,18 @@ class Ground:
     is_coast: bool
 
     def scenes(self) -> list[Scene]:
-        """Return the kinds of ground; "sparse", too, where nothing else is found.
+        """Return the kinds of ground: "urban", "suburban" or "rural", and what else there is.
 
         Examples
         --------
         >>> shares = {"built": 0.01, "fields": 0.0, "water": 0.2, "industry": 0.0, "bare": 0.0, "drawn": 0.6}
         >>> Ground(**shares, wood=0.3, is_coast=False).scenes()
-        ['riverside', 'forest', 'shore']
+        ['rural', 'riverside', 'forest', 'shore']
         """
         found: dict[Scene, bool] = {
             "urban": self.built >= URBAN,
             "suburban": SUBURBAN <= self.built < URBAN,
+            "rural": self.built < SUBURBAN,
             "industrial": self.industry >= INDUSTRY,
             "riverside": self.water >= WATER and not self.is_coast,
             "agricultural": self.fields >= FIELDS,
@@ -72,7 +73,7 @@ class Ground:
             "shore": self.water >= SHORE and self.built < SUBURBAN,
             "sparse": self.drawn < SPARSE,
         }
-        return [name for name, is_there in found.items() if is_there] or ["sparse"]
+        return [name for name, is_there in found.items() if is_there]
 
 
 def measure_ground(path: Path, grid: Grid, *, at: dt.date | None = None) -> Ground:

@@ -310,7 +310,7 @@ def test_one_town_under_two_names_in_two_parts_is_caught(program, own_out, tmp_p
     for kind in ("holdout", "crossfit"):
         split = split_file(tmp_path, RIVERSIDE, "elsewhere", "town-grid", "town-suburb", kind=kind)
         code, printed, err = program("verify", split, "--regions", path.parent, "--out", own_out)
-        assert (code, err) == (2, "not searched, for not built: town-suburb\n")
+        assert (code, err) == (2, "not searched, for not built: 1 region (town-suburb)\n")
         (line,) = printed.splitlines()
         assert f"{RIVERSIDE}/0-0 and elsewhere/0-0 of different parts hold the same ground: " in line
         assert int(line.split("ground: ")[1].split()[0]) > 50

@@ -305,7 +305,8 @@ def test_no_block_of_ten_buildings_stands_in_two_parts_of_the_world(real_extract
     regions = {name: read_region_file(list_region_files()[name]) for name in spec.region_ids}
     maps = {}
     for name, region in regions.items():
-        path = find_extract(region.pick(None), folders=[real_extracts])
-        maps[name] = Arrangements.of(read_extract(path, region.grid()).features)
+        extract = region.pick(None)
+        path = find_extract(extract, folders=[real_extracts])
+        maps[name] = Arrangements.of(read_extract(path, region.grid(), at=extract.date).features)
     assert sum(map(len, maps.values())) > 300_000
     assert search_look_alikes(make_split(spec, {name: region.grid() for name, region in regions.items()}), maps) == ()

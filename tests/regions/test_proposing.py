@@ -127,6 +127,20 @@ def test_a_line_of_a_manifest_is_a_region_that_is_built_and_knows_its_country(to
     assert read_manifest(out / "regions" / "garden").counts["building"] > 20
 
 
+def test_two_places_are_added_by_a_line_each(towns, manifest, program, tmp_path):
+    rows = [
+        f'  {{ file = "{file}", place = "{place}", country = "Nowhere", what = "town", date = 2020-01-01 }},'
+        for file, place in ((SECOND, "garden"), (MILL, "mill"))
+    ]
+    into, out = tmp_path / "mine", tmp_path / "out"
+    listed = manifest("extract = [", *rows, "]")
+    assert program("propose-regions", listed, "--into", into, "--extracts", towns)[0] == 0
+    assert program("build-region", "--every", "--region-files", into, "--extracts", towns, "--out", out)[0] == 0
+    for place in ("garden", "mill"):
+        assert read_manifest(out / "regions" / place).coverage.share > 0.3  # 600 m in the smallest window
+        assert (out / "regions" / place / "preview.png").is_file()
+
+
 def test_each_date_keeps_how_it_is_known_and_where_it_comes_from(towns, manifest):
     rows = (row(FIRST, "garden", date_known_by="header", source="shelf 1"), row(SECOND, "garden", source="shelf 2"))
     ((_, text),) = propose_regions(manifest(*rows), folders=[towns])

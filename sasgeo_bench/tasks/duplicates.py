@@ -236,7 +236,8 @@ def find_alike(first: Arrangements, second: Arrangements, *, within_m: float = A
     >>> len(find_alike(Arrangements.of(town), Arrangements.of(copy)).first)
     40
     """
-    listed = KDTree(first.keys).query_ball_tree(KDTree(second.keys), 2 * within_m, p=np.inf)
+    # `query_ball_tree` takes four times as long.
+    listed = np.asarray(KDTree(second.keys).query_ball_point(first.keys, 2 * within_m, p=np.inf), dtype=object)
     one = np.repeat(np.arange(len(listed)), [len(found) for found in listed])
     two = np.fromiter((row for found in listed for row in found), dtype=np.int64, count=len(one))
     apart_m = np.full(len(one), np.inf)

@@ -228,8 +228,9 @@ Regions by [scene](howto/region.md#many-places-at-once) and part; a region may h
 
 {scenes_table()}
 
-No region is `desert`: the largest share of mapped bare ground is below 15 %, for deserts are hardly mapped, and what
-is not mapped cannot be told from what is empty. `alpine` needs heights, which a map lacks, and is no longer told.
+No region is `desert`: no map has 15 % of bare ground (the whole of Andorra, in no part, has 14 %), for deserts are
+hardly mapped, and what is not mapped cannot be told from what is empty. `alpine` needs heights, which a map lacks, and
+is no longer told.
 
 ## Look-alike buildings
 

@@ -1,28 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table and the contact sheet of all real places: .venv/bin/python docs/figures/places.py --out out.
+"""The tables and the contact sheet of all real places: .venv/bin/python docs/figures/places.py --out out.
 
 `build-region --every` built them before. Views are those of the suite `clean` that overlap no other, of the newest map.
+With --scenes it measures the scenes of every real region instead, and writes them into `regions/*.toml`.
 """
 
 import argparse
+import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from itertools import combinations_with_replacement
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.osm.locate import find_extract
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import paint_overview
 from sasgeo_bench.regions.proposing import STEP_M
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
+from sasgeo_bench.regions.region_spec import RegionFile, Scene, list_region_files, read_region_file
+from sasgeo_bench.regions.scenes import measure_ground
 from sasgeo_bench.tasks.build import read_scene
-from sasgeo_bench.tasks.split import Place, Split, find_split_file, make_split, read_split_file
+from sasgeo_bench.tasks.duplicates import ALIKE_M, BLOCK, Arrangements, find_alike
+from sasgeo_bench.tasks.split import Part, Place, Split, find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.suites.base import Seeds
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.task_plan import Request
@@ -35,9 +43,11 @@ HEAD = f"""# Places
 
 Every real place that ships, by part of the split [`{SPLIT}`](../splits/README.md) and country. *km2*: mapped ground.
 *Built*: mapped ground in steps of {STEP_M:.0f} m with a building. *Drawn*: mapped ground under any class. *Views*: of
-192 m, drawn by the suite `clean`, none of which overlaps another of its region (a few regions of one city share up to
-1 km2); a place counts with two. *Sealed* places are asked by a seed that is given at run time. `python
-docs/figures/places.py --out out` writes this page and the sheet anew, of what `build-region --every` built.
+192 m, drawn by the suite `clean`, none of which overlaps another of its region; a place counts with two. A few regions
+of one city share up to 1 km2, Runavik and Toftir 2 km2: they are one place, so that no draw of places counts that
+ground as two. Only `rapperswil` and `rueti`, of one part, are two places and share 0.5 km2. *Sealed* places are asked
+by a seed that is given at run time. `python docs/figures/places.py --out out` writes this page and the sheet anew, of
+what `build-region --every` built.
 
 ![A small map of every region, by place](figures/places.webp)
 
@@ -171,15 +181,107 @@ def left_out() -> list[str]:
     return sorted(spec.id for spec in specs if spec.provenance.country and spec.id not in split().spec.region_ids)
 
 
+def scenes_table() -> str:
+    """Return how many regions of each part have each scene."""
+    files, parts = list_region_files(), get_args(Part)
+    counts = Counter(
+        (scene, place.part)
+        for place in split().spec.place
+        for region in place.region_ids
+        for scene in read_region_file(files[region]).scenes
+    )
+    rows = [[scene, *(str(counts[scene, part]) for part in parts)] for scene in get_args(Scene)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in [["scene", *parts], ["---"] * (1 + len(parts)), *rows])
+
+
+def look_alikes(out: Path, *, as_drawn: bool) -> str:
+    """Return the row of a table: blocks of ten, pairs that are alike across parts and within, and the nearest pair."""
+    maps: dict[str, list[tuple[str, Arrangements]]] = {}
+    for place in split().spec.place:
+        for region in place.region_ids:
+            features = region_files.read_features(out / "regions" / region)
+            found = Arrangements.of(features, as_drawn=as_drawn)
+            maps.setdefault(str(place.part), []).append((place.name, found))
+    joined = {part: Arrangements.joined([one for _, one in rows]) for part, rows in maps.items()}
+    places = {part: np.repeat([name for name, _ in rows], [len(one) for _, one in rows]) for part, rows in maps.items()}
+    pairs: Counter[str] = Counter()
+    for one, two in combinations_with_replacement(joined, 2):
+        if one == two and as_drawn:
+            continue  # rows of garages: too many pairs
+        alike = find_alike(joined[one], joined[two])
+        if one != two:
+            pairs["parts"] += len(alike.first)
+            continue
+        is_inside = places[one][alike.first] == places[two][alike.second]
+        pairs["place"] += int(is_inside.sum()) // 2  # a pair is found from either side
+        pairs["part"] += int((~is_inside).sum()) // 2
+    inside = ["not counted"] * 2 if as_drawn else [str(pairs["place"]), str(pairs["part"])]
+    label = "as they are drawn" if as_drawn else "touching ones as one"
+    return f"| {label} | {sum(map(len, joined.values())):,} | {' | '.join(inside)} | {pairs['parts']} |"
+
+
+def more_sections(out: Path) -> str:
+    """Return the sections below the table of places."""
+    return f"""## Scenes
+
+Regions by [scene](howto/region.md#many-places-at-once) and part; a region may have several.
+
+{scenes_table()}
+
+No region is `desert`: no map has 15 % of bare ground (the whole of Andorra, in no part, has 14 %), for deserts are
+hardly mapped, and what is not mapped cannot be told from what is empty. `alpine` needs heights, which a map lacks, and
+is no longer told.
+
+## Look-alike buildings
+
+Each building with its nine nearest ones is a block of ten. Two blocks are alike if, once one is moved and rotated, no
+outline is farther than {ALIKE_M:g} m from the other's (Hausdorff distance); pairs that share a building do not count.
+Pairs of blocks of {BLOCK}:
+
+| buildings | blocks | alike in one place | in two places of one part | in two parts |
+|---|---|---|---|---|
+{look_alikes(out, as_drawn=False)}
+{look_alikes(out, as_drawn=True)}
+
+As they are drawn, rows of garages and of terraced houses are blocks of ten, and rows of equal width stand in many
+countries: every pair across parts is of units that touch one another. On a map of cells such a row is one shape, so
+touching buildings count as one, and then no block of ten stands in two parts. `sasgeo-bench verify {SPLIT}` says so.
+"""
+
+
+def measure_scenes() -> None:
+    """Write the measured scenes into the file of every region of an OSM extract."""
+    for path in list_region_files().values():
+        spec = read_region_file(path)
+        extract = spec.pick(None)
+        if extract.town is None and extract.format != "geojson":
+            write_scenes(path, measure_ground(find_extract(extract), spec.grid(), at=extract.date).scenes())
+
+
+def write_scenes(path: Path, scenes: list[Scene]) -> None:
+    """Replace the line of scenes of a region file."""
+    listed = ", ".join(f'"{scene}"' for scene in scenes)
+    text = re.sub(r"(?m)^scenes = \[.*\]$", f"scenes = [{listed}]", path.read_text(encoding="utf-8"))
+    path.write_text(text, encoding="utf-8")
+
+
 def main() -> None:
-    """Write docs/places.md and docs/figures/places.webp."""
+    """Write docs/places.md and docs/figures/places.webp, or scenes."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    found = list(rows_and_maps(parser.parse_args().out))
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument("--scenes", action="store_true")
+    given = parser.parse_args()
+    if given.scenes:
+        measure_scenes()
+        return
+    found = list(rows_and_maps(given.out))
     sheet = sheet_of([one for _, regions in found for one in regions])
     cv2.imwrite(str(DOCS / "figures" / "places.webp"), sheet, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
     text = (
-        HEAD + "\n".join(row for row, _ in found) + f"\n\nIn no part, for want of two views: {', '.join(left_out())}.\n"
+        HEAD
+        + "\n".join(row for row, _ in found)
+        + f"\n\nIn no part, for want of two views: {', '.join(left_out())}.\n\n"
+        + more_sections(given.out)
     )
     (DOCS / "places.md").write_text(text, encoding="utf-8")
 

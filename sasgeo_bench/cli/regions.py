@@ -77,7 +77,7 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
     >>> [folder.as_posix() for folder in folders]
     ['out/regions/town-grid@2019-01-01', 'out/regions/town-suburb@2019-01-01']
     """
-    specs = _wanted(options)
+    wanted = _wanted(options)
     plan = partial(
         build.plan_build,
         out=options.out,
@@ -86,10 +86,11 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
         imagery_folders=options.imagery or (),
         with_preview=True,
     )
+    specs = [spec for spec in wanted.values() if spec is not None]
     if not options.every:
         plans = [plan(spec) for spec in specs]
     else:
-        plans = [one for one in (_attempt(spec, plan) for spec in specs) if one is not None]
+        plans = [one for one in (_attempt(spec.id, partial(plan, spec)) for spec in specs) if one is not None]
     if options.dry_run:
         options.say("\n".join(plan.to_text() for plan in plans))
         return tuple(plan.folder for plan in plans)
@@ -101,39 +102,40 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
         label="regions built",
     )
     done = {plan.spec.id for plan, found in zip(plans, built, strict=True) if found is not None}
-    failed = [spec.id for spec in specs if spec.id not in done]
+    failed = [name for name in wanted if name not in done]
     if failed:
-        raise ConfigError(f"not built: {named(failed, 'region')} of {len(specs)}; the lines above say why")
+        raise ConfigError(f"not built: {named(failed, 'region')} of {len(wanted)}; the lines above say why")
     return tuple(plan.folder for plan in plans)
 
 
 def _build(plan: build.BuildPlan) -> Manifest | None:
-    return _attempt(plan.spec, lambda _: build.build_region(plan))
+    return _attempt(plan.spec.id, partial(build.build_region, plan))
 
 
-def _attempt(spec: RegionFile, work: Callable[[RegionFile], Result]) -> Result | None:
+def _attempt(name: str, work: Callable[[], Result]) -> Result | None:
     """Do what one region needs; if that fails, a line says why, and the others are done."""
     try:
-        return work(spec)
+        return work()
     except SasgeoError as error:
-        tell(f"{spec.id}: not built: {error}")
+        tell(f"{name}: not built: {error}")
         return None
 
 
-def _wanted(options: BuildOptions) -> list[RegionFile]:
-    """Return the regions to build; every real one has an extract with a hash."""
+def _wanted(options: BuildOptions) -> dict[str, RegionFile | None]:
+    """Return the regions to build, by name; None, and a line, for one of `every` that cannot be read."""
     folders = options.region_files or ()
     if bool(options.region) == options.every:
         raise ConfigError("name regions to build, or build --every region, not both: list regions shows them")
     if not options.every:
-        return [read_region_file(find_region_file(name, folders=folders)) for name in options.region or ()]
+        specs = [read_region_file(find_region_file(name, folders=folders)) for name in options.region or ()]
+        return {spec.id: spec for spec in specs}
     if not folders:
-        shipped = [read_region_file(path) for path in list_region_files().values()]
-        return [spec for spec in shipped if spec.extract[0].town is None]
+        shipped = {name: read_region_file(path) for name, path in list_region_files().items()}
+        return {name: spec for name, spec in shipped.items() if spec.extract[0].town is None}
     paths = [path for folder in folders for path in sorted(folder.glob("*.toml"))]
     if not paths:
         raise ConfigError(f"{', '.join(map(str, folders))}: no region file (*.toml) to build")
-    return [read_region_file(path) for path in paths]
+    return {path.stem: _attempt(path.stem, partial(read_region_file, path)) for path in paths}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +154,8 @@ class ProposeOptions(Options):
 def propose_regions(options: ProposeOptions) -> tuple[Path, ...]:
     """Write region files for the extracts of a manifest: one to three windows for each place, where it is built.
 
-    A file that is there already stays as it is; a place whose extracts have regions in the package is left out.
+    A file that is there already stays as it is, and is not made anew if its extracts are the same; a place whose
+    extracts have regions in the package is left out.
 
     Returns
     -------
@@ -177,8 +180,12 @@ def propose_regions(options: ProposeOptions) -> tuple[Path, ...]:
     from sasgeo_bench.regions.proposing import propose_regions as proposed  # noqa: PLC0415 - build-region needs none
 
     known = [read_region_file(path) for path in list_region_files().values()]
+    there = {path.stem: path for path in sorted(options.into.glob("*.toml"))}
+    written = {name: spec for name, path in there.items() if (spec := _read(path)) is not None}
     found = []
-    for name, text in proposed(options.manifest, folders=options.extracts or (), known=known, jobs=options.jobs):
+    for name, text in proposed(
+        options.manifest, folders=options.extracts or (), known=known, written=written, jobs=options.jobs
+    ):
         path = options.into / f"{name}.toml"
         found.append(path)
         if not os.path.lexists(path):
@@ -188,6 +195,14 @@ def propose_regions(options: ProposeOptions) -> tuple[Path, ...]:
         elif not _holds(path, text):
             tell(f"{path}: kept, although the manifest gives another: remove it to have that")
     return tuple(found)
+
+
+def _read(path: Path) -> RegionFile | None:
+    """Return a region file that was written before; None if it is none."""
+    try:
+        return read_region_file(path)
+    except SasgeoError:
+        return None
 
 
 def _holds(path: Path, text: str) -> bool:

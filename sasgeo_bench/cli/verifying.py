@@ -12,7 +12,7 @@ from sasgeo_bench.boards.run_cases import is_run
 from sasgeo_bench.cli.console import EXIT_USER, complain, say, shown_progress
 from sasgeo_bench.cli.options import Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
-from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.errors import ConfigError, counted, named
 from sasgeo_bench.core.progress import spread, tell
 from sasgeo_bench.exchange.submissions import hold_submission
 from sasgeo_bench.regions.region_files import differing_files, read_features
@@ -20,7 +20,7 @@ from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running.prediction_files import Violation, parts_of
 from sasgeo_bench.scoring.submission_files import count_excluded, is_submission, validate
 from sasgeo_bench.tasks.build import check_task
-from sasgeo_bench.tasks.duplicates import constellations, search_split
+from sasgeo_bench.tasks.duplicates import BLOCK, Arrangements, constellations, search_look_alikes, search_split
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.task_files import Task
 
@@ -122,16 +122,22 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
     built = [region for region in split.spec.region_ids if (out / "regions" / region).is_dir()]
     missing = [region for region in split.spec.region_ids if region not in built]
     if missing:
-        tell(f"not searched, for not built: {', '.join(missing)}")
+        tell(f"not searched, for not built: {named(missing, 'region')}")
     if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:
         raise ConfigError(
             f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
         )
     with shown_progress():
         read = spread(lambda name: read_features(out / "regions" / name), built, label="regions read")
-        maps = dict(zip(built, map(constellations, read), strict=True))
+        described = [(constellations(features), Arrangements.of(features)) for features in read]
+    maps, blocks = (dict(zip(built, side, strict=True)) for side in zip(*described, strict=True))
     faults = [
         f"{item.first} and {item.second} of different parts hold the same ground: {item.count} buildings lie alike"
         for item in search_split(split, maps)
+    ] + [
+        f"{item.first} and {item.second} of different parts look alike: {counted(item.count, 'pair')} of blocks of "
+        f"{BLOCK} buildings"
+        for item in search_look_alikes(split, blocks)
     ]
-    return faults, f"no two parts share ground, {counted(len(built), 'region')} searched"
+    searched = f"{counted(len(built), 'region')} and {sum(map(len, blocks.values()))} blocks of {BLOCK} buildings"
+    return faults, f"no two parts share ground or look alike, {searched} searched"

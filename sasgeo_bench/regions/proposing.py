@@ -10,18 +10,17 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
-import geopandas as gpd
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field
 
-from sasgeo_bench.core.config import LONGEST_LINE, Document, Line, parse_toml
-from sasgeo_bench.core.errors import ConfigError, SasgeoError, named
+from sasgeo_bench.core.config import LONGEST_LINE, Document, Line, check_document, parse_toml
+from sasgeo_bench.core.errors import ConfigError, CoverageError, SasgeoError, named
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
-from sasgeo_bench.geometry.grid import utm_epsg
+from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.osm.locate import Extract, PlainName, Sha256, extract_folders, find_extract
 from sasgeo_bench.osm.read import read_extract
@@ -29,6 +28,7 @@ from sasgeo_bench.osm.scan import scan_file
 from sasgeo_bench.osm.snapshot import open_snapshot
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region_spec import Identifier, RegionFile
+from sasgeo_bench.regions.scenes import measure_ground
 
 STEP_M: Final = 128.0  # of the lattice on which windows lie
 SHORTEST_M: Final = 1536.0  # side of one of several windows of a place
@@ -41,12 +41,32 @@ _WORTH: Final = 0.15  # a window grows where this share of what it gains is buil
 _REACH_M: Final = 60_000.0  # from the middle of the buildings: what lies farther away is a stray object
 _WORLD: Final = (-180.0, -90.0, 180.0, 90.0)
 _ADDRESS: Final = re.compile(r"https?://\S+")
+_COMMIT: Final = re.compile(r"\b([0-9a-f]{12})[0-9a-f]{28}\b")
 
 Cells = NDArray[np.int64]
 
 
+def _as_day(given: object) -> object:
+    """Refuse a text that is no day; whatever else is wrong the model tells."""
+    if isinstance(given, str):
+        try:
+            dt.date.fromisoformat(given)
+        except ValueError as error:
+            raise ValueError(f"'date' is a day, YYYY-MM-DD, got {given!r}") from error
+    return given
+
+
+def _as_name(given: object) -> object:
+    """Refuse a text that cannot be the id of a region."""
+    if isinstance(given, str) and not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", given):
+        raise ValueError(f"'place' has small letters, digits and hyphens between them, got {given!r}")
+    return given
+
+
 class ListedExtract(Document):
     """One `[[extract]]` of a manifest; keys that are not read here are its owner's.
+
+    `title` names the place in the titles of its regions; without it they take the id.
 
     Without `sha256` the file is taken as it lies there. `source` says where it comes from: an address is one to
     download it from where `source_sha256` is the hash of what lies there; any other text is stated and no more.
@@ -55,10 +75,11 @@ class ListedExtract(Document):
     model_config = ConfigDict(extra="ignore", strict=False)
 
     file: PlainName
-    place: Identifier
+    place: Annotated[Identifier, BeforeValidator(_as_name)]
     country: Line
     what: Line
-    date: dt.date
+    date: Annotated[dt.date, BeforeValidator(_as_day)]
+    title: Line | None = None
     date_known_by: Line | None = None
     sha256: Sha256 | None = None
     source: Line | None = None
@@ -66,27 +87,41 @@ class ListedExtract(Document):
 
 
 class ExtractManifest(Document):
-    """A list of dated extracts of places."""
+    """A list of dated extracts of places, as it was written."""
 
     model_config = ConfigDict(extra="ignore")
 
-    extract: Annotated[list[ListedExtract], Field(min_length=1)]
+    extract: Annotated[list[dict[str, object]], Field(min_length=1)]
 
-    def places(self) -> dict[str, list[ListedExtract]]:
-        """Return the extracts of each place by date; raise `ConfigError` if two are of one day, or of two countries."""
-        found: dict[str, list[ListedExtract]] = {}
-        for item in sorted(self.extract, key=lambda one: one.date):
-            found.setdefault(item.place, []).append(item)
-        for place, items in found.items():
-            dates, countries = [item.date for item in items], {item.country for item in items}
-            if len(set(dates)) < len(dates):
-                raise ConfigError(f"{place}: two extracts are of one day: keep one of them")
-            if len(countries) > 1:
-                raise ConfigError(f"{place} lies in {' and in '.join(sorted(countries))}: give each its own name")
-            other = next((name for name in names_of(place)[1:] if name in found), None)
-            if other is not None:
-                raise ConfigError(f"{other} may be the name of a second region of {place}: rename one of the places")
-        return found
+
+def read_places(path: Path) -> dict[str, list[ListedExtract]]:
+    """Read the extracts of each place of a manifest, by date.
+
+    Raise `ConfigError`, which names the block, if the file is no manifest, two extracts of a place are of one day or of
+    two countries, or a place has the name of another one's second region.
+    """
+    try:
+        text = plain_file(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: name a manifest of extracts (*.toml)") from error
+    blocks = parse_toml(text, ExtractManifest, source=str(path)).extract
+    listed = [
+        check_document(block, ListedExtract, source=f"{path}: extract {number} ({block.get('file', 'without a file')})")
+        for number, block in enumerate(blocks, start=1)
+    ]
+    found: dict[str, list[ListedExtract]] = {}
+    for item in sorted(listed, key=lambda one: one.date):
+        found.setdefault(item.place, []).append(item)
+    for place, items in found.items():
+        dates, countries = [item.date for item in items], {item.country for item in items}
+        if len(set(dates)) < len(dates):
+            raise ConfigError(f"{place}: two extracts are of one day: keep one of them")
+        if len(countries) > 1:
+            raise ConfigError(f"{place} lies in {' and in '.join(sorted(countries))}: give each its own name")
+        other = next((name for name in names_of(place)[1:] if name in found), None)
+        if other is not None:
+            raise ConfigError(f"{other} may be the name of a second region of {place}: rename one of the places")
+    return found
 
 
 def names_of(place: str) -> list[str]:
@@ -203,75 +238,38 @@ def _best(gain: NDArray[np.float64], low: int, high: int) -> tuple[int, int, int
     return found
 
 
-URBAN: Final = 0.15  # share of the mapped ground under buildings
-SUBURBAN: Final = 0.03
-FIELDS: Final = 0.15  # share of the mapped ground
-WATER: Final = 0.02
-
-
-def scenes_of(features: gpd.GeoDataFrame, ground: shapely.Geometry) -> list[str]:
-    """Return the kinds of ground of a region, measured on what is mapped of it; "suburban" where none is found.
-
-    Industry is not told: large buildings are campuses and city blocks as often as works.
-
-    Parameters
-    ----------
-    features : GeoDataFrame
-        Those of a `Reading`, in metres.
-    ground : shapely.Geometry
-        The mapped part of the region.
-
-    Examples
-    --------
-    >>> squares = [shapely.box(0, 0, 40, 40), shapely.box(60, 0, 100, 100)]
-    >>> features = gpd.GeoDataFrame({"class": ["building", "farmland"]}, geometry=squares)
-    >>> scenes_of(features.assign(osm_type="way"), shapely.box(0, 0, 100, 100))
-    ['urban', 'agricultural']
-    """
-    names, shapes = features["class"].to_numpy(str), features.geometry.to_numpy()
-    is_area = np.isin(shapely.get_type_id(shapes), (3, 6))
-
-    def share(name: str) -> float:
-        return float(shapely.area(shapely.intersection(shapes[is_area & (names == name)], ground)).sum() / ground.area)
-
-    built = share("building")
-    is_coast = bool((features["osm_type"] == "coastline").any())
-    found = {
-        "urban": built >= URBAN,
-        "suburban": SUBURBAN <= built < URBAN,
-        "riverside": share("water") >= WATER and not is_coast,
-        "coastal": is_coast,
-        "agricultural": share("farmland") >= FIELDS,
-    }
-    return [name for name, is_there in found.items() if is_there] or ["suburban"]
-
-
 def propose_regions(
-    manifest: Path, *, folders: Sequence[Path] = (), known: Iterable[RegionFile] = (), jobs: int = 1
+    manifest: Path,
+    *,
+    folders: Sequence[Path] = (),
+    known: Iterable[RegionFile] = (),
+    written: Mapping[str, RegionFile] | None = None,
+    jobs: int = 1,
 ) -> Iterator[tuple[str, str]]:
     """Yield id and text of a region file for each window of each place of a manifest.
 
     Files are looked for as `build_region` does, in `folders` and beside the manifest first. A place is left out if a
     region of `known` has its name or one of its extracts, or if its newest extract cannot be read, or has no building:
-    a line says which. Raise `ConfigError` if the manifest is wrong, and once all others are done if a place is left out
-    for a fault.
+    a line says which. A place of whose extracts the regions of `written`, by id, were made is not read again. An older
+    map that lies on other ground is left out of a region, with a line. Raise `ConfigError` if the manifest is wrong,
+    and once all others are done if a place is left out for a fault.
     """
-    try:
-        text = plain_file(manifest).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{manifest} cannot be read: name a manifest of extracts (*.toml)") from error
-    places = parse_toml(text, ExtractManifest, source=str(manifest)).places()
-    taken = {name for spec in known for name in (spec.id, *(extract.file for extract in spec.extract))}
+    places = read_places(manifest)
+    taken = {name: spec.id for spec in known for name in (spec.id, *(extract.file for extract in spec.extract))}
     jobs_of = []
     for place, listed in places.items():
-        if not taken.isdisjoint({*names_of(place), *(item.file for item in listed)}):
-            tell(f"{place}: has regions already")
+        found = next((name for name in (*names_of(place), *(item.file for item in listed)) if name in taken), None)
+        if found is None:
+            jobs_of.append(
+                _Place(name=place, listed=tuple(listed), folders=(*folders, manifest.parent), written=written or {})
+            )
         else:
-            jobs_of.append(_Place(name=place, listed=tuple(listed), folders=(*folders, manifest.parent)))
+            holds = "" if found == taken[found] else f" holds {found}"
+            tell(f"{place}: has regions already: region {taken[found]}{holds}")
     left = []
-    for one, found in zip(jobs_of, spread(reported(_proposed), jobs_of, jobs=jobs, label="places read"), strict=True):
-        yield from found
-        left += [] if found else [one.name]
+    for one, texts in zip(jobs_of, spread(reported(_proposed), jobs_of, jobs=jobs, label="places read"), strict=True):
+        yield from texts
+        left += [] if texts else [one.name]
     if left:
         raise ConfigError(f"no region of {named(left, 'place')} of {len(places)}; the lines above say why")
 
@@ -281,28 +279,71 @@ class _Place:
     name: str
     listed: tuple[ListedExtract, ...]
     folders: tuple[Path, ...]
+    written: Mapping[str, RegionFile]
 
 
 def _proposed(place: _Place) -> list[tuple[str, str]]:
     """Return id and text of each region of a place; none, and a line, if that cannot be."""
     try:
         extracts = [_extract(item, place.folders) for item in place.listed]
+        there = _there(place, extracts)
+        if there:
+            return there
         path = find_extract(extracts[-1], folders=place.folders)
         windows = find_windows(_houses(path, place.listed[-1].date))
         found = []
         for name, window in zip(names_of(place.name), windows, strict=False):
-            text = partial(_text, name, place.listed, extracts, window)
-            spec = parse_toml(
-                text(["urban"]), RegionFile, source=f"its region {name}"
-            )  # of any scene, to read the ground
-            reading = read_extract(path, spec.grid(), at=place.listed[-1].date)
-            found.append((name, text(scenes_of(reading.features, reading.coverage))))
+            write = partial(_text, name, centre=window.center_lonlat, size_m=window.size_m)
+            text = write(place.listed, extracts, scenes=["sparse"])  # of any scene, to read the ground
+            grid = parse_toml(text, RegionFile, source=f"its region {name}").grid()
+            scenes = measure_ground(path, grid, at=place.listed[-1].date).scenes()
+            dates = [number for number in range(len(extracts)) if _holds(place, extracts[number], grid, name)]
+            found.append(
+                (name, write([place.listed[at] for at in dates], [extracts[at] for at in dates], scenes=scenes))
+            )
     except SasgeoError as error:
         tell(f"{place.name}: left out: {error}")
         return []
     if not found:
         tell(f"{place.name}: left out: {path.name} has no building")
     return found
+
+
+def _there(place: _Place, extracts: Sequence[Extract]) -> list[tuple[str, str]]:
+    """Return the regions of a place that were made of the same extracts before, with what the manifest says now."""
+    found = []
+    for name in names_of(place.name):
+        spec = place.written.get(name)
+        if spec is None or spec.center_lonlat is None or spec.size_m is None:
+            continue
+        hashes = {item.file: set(item.sha256) for item in spec.extract}
+        kept = [at for at, item in enumerate(extracts) if not hashes.get(item.file, set()).isdisjoint(item.sha256)]
+        if len(kept) < len(hashes) or kept[-1:] != [len(extracts) - 1]:
+            return []  # a file is new, or another: the windows may lie elsewhere
+        listed = [place.listed[at] for at in kept]
+        text = _text(
+            name,
+            listed,
+            [extracts[at] for at in kept],
+            centre=spec.center_lonlat,
+            size_m=spec.size_m,
+            scenes=spec.scenes,
+        )
+        found.append((name, text))
+    return found
+
+
+def _holds(place: _Place, extract: Extract, grid: Grid, name: str) -> bool:
+    """Return whether an older map that is on this machine holds the ground of a region; a line says if it does not."""
+    files = (folder / extract.file for folder in extract_folders(place.folders))
+    if extract.date == place.listed[-1].date or not any(path.is_file() for path in files):
+        return True
+    try:
+        read_extract(find_extract(extract, folders=place.folders), grid, at=extract.date)
+    except CoverageError as error:
+        tell(f"{name}: without its map of {extract.date}: {error}")
+        return False
+    return True
 
 
 def _extract(item: ListedExtract, folders: Sequence[Path]) -> Extract:
@@ -336,12 +377,14 @@ def _text(
     name: str,
     listed: Sequence[ListedExtract],
     extracts: Sequence[Extract],
-    window: Window,
+    *,
+    centre: tuple[float, float],
+    size_m: tuple[float, float],
     scenes: Iterable[str],
 ) -> str:
     newest = listed[-1]
-    titled = name.replace("-", " ").title()
-    width_m, height_m = window.size_m
+    number = name.removeprefix(newest.place).removeprefix("-")
+    titled = (newest.title or newest.place.replace("-", " ").title()) + (f" ({number})" if number else "")
     dated_by = _of_dates({item.date: item.date_known_by for item in listed})
     stated = zip(listed, extracts, strict=True)
     origin = _of_dates({item.date: item.source for item, extract in stated if not extract.urls})
@@ -350,8 +393,8 @@ def _text(
         f"id = {_quoted(name)}",
         f"title = {_quoted(f'{titled}, {newest.country}: {newest.what}')}",
         f"scenes = [{', '.join(map(_quoted, scenes))}]",
-        f"center_lonlat = [{', '.join(map(str, window.center_lonlat))}]",
-        f"size_m = [{width_m:.0f}, {height_m:.0f}]",
+        f"center_lonlat = [{', '.join(map(str, centre))}]",
+        f"size_m = [{', '.join(f'{side:.0f}' for side in size_m)}]",
         "cell_size_m = 1.0",
         "",
         "[provenance]",
@@ -367,7 +410,9 @@ def _text(
 
 
 def _of_dates(texts: Mapping[dt.date, str | None]) -> str | None:
-    """Return a text that all dates share, or each after its date; those of the last dates if it would be too long.
+    """Return a text that all dates share, or each after its date; commits are cut to 12 digits if it would be too long.
+
+    What is too long even so loses its first dates.
 
     >>> _of_dates({dt.date(2014, 1, 1): "header", dt.date(2018, 1, 1): "name"})
     '2014-01-01: header; 2018-01-01: name'
@@ -375,6 +420,8 @@ def _of_dates(texts: Mapping[dt.date, str | None]) -> str | None:
     if len(set(texts.values())) <= 1:
         return next(iter(texts.values()), None)
     lines = [f"{date.isoformat()}: {text}" for date, text in texts.items() if text]
+    if len("; ".join(lines)) > LONGEST_LINE:
+        lines = [_COMMIT.sub(r"\1", line) for line in lines]
     while len("; ".join(lines)) > LONGEST_LINE:
         del lines[0]
     return "; ".join(lines) or None

@@ -27,7 +27,20 @@ MAX_CELLS: Final = 4e9
 _EDGE_POINTS: Final = 21
 _M_PER_DEG: Final = 111_320.0
 
-Scene = Literal["urban", "suburban", "industrial", "riverside", "agricultural", "alpine", "coastal", "forest"]
+Scene = Literal[
+    "urban",
+    "suburban",
+    "rural",
+    "industrial",
+    "riverside",
+    "agricultural",
+    "alpine",
+    "coastal",
+    "forest",
+    "desert",
+    "shore",
+    "sparse",
+]
 Corner = Annotated[tuple[float, float], Field(strict=False)]
 Identifier = Annotated[str, StringConstraints(pattern=r"^[a-z0-9]+(-[a-z0-9]+)*$")]
 

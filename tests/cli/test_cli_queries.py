@@ -299,7 +299,8 @@ def test_one_target_is_verified_and_tasks_are_for_answers_alone(mistake, out):
 def test_the_towns_of_the_shipped_splits_share_no_ground(name, program, towns):
     code, printed, err = program("verify", name, "--out", towns)
     assert code == 0
-    assert printed == f"{name}: no two parts share ground, 2 regions searched\n"
+    assert printed.startswith(f"{name}: no two parts share ground or look alike, 2 regions and ")
+    assert printed.endswith(" blocks of 10 buildings searched\n")
     assert err.startswith("not searched, for not built: ")
 
 
@@ -309,7 +310,7 @@ def test_one_town_under_two_names_in_two_parts_is_caught(program, own_out, tmp_p
     for kind in ("holdout", "crossfit"):
         split = split_file(tmp_path, RIVERSIDE, "elsewhere", "town-grid", "town-suburb", kind=kind)
         code, printed, err = program("verify", split, "--regions", path.parent, "--out", own_out)
-        assert (code, err) == (2, "not searched, for not built: town-suburb\n")
+        assert (code, err) == (2, "not searched, for not built: 1 region (town-suburb)\n")
         (line,) = printed.splitlines()
         assert f"{RIVERSIDE}/0-0 and elsewhere/0-0 of different parts hold the same ground: " in line
         assert int(line.split("ground: ")[1].split()[0]) > 50

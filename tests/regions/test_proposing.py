@@ -127,6 +127,20 @@ def test_a_line_of_a_manifest_is_a_region_that_is_built_and_knows_its_country(to
     assert read_manifest(out / "regions" / "garden").counts["building"] > 20
 
 
+def test_two_places_are_added_by_a_line_each(towns, manifest, program, tmp_path):
+    rows = [
+        f'  {{ file = "{file}", place = "{place}", country = "Nowhere", what = "town", date = 2020-01-01 }},'
+        for file, place in ((SECOND, "garden"), (MILL, "mill"))
+    ]
+    into, out = tmp_path / "mine", tmp_path / "out"
+    listed = manifest("extract = [", *rows, "]")
+    assert program("propose-regions", listed, "--into", into, "--extracts", towns)[0] == 0
+    assert program("build-region", "--every", "--region-files", into, "--extracts", towns, "--out", out)[0] == 0
+    for place in ("garden", "mill"):
+        assert read_manifest(out / "regions" / place).coverage.share > 0.3  # 600 m in the smallest window
+        assert (out / "regions" / place / "preview.png").is_file()
+
+
 def test_each_date_keeps_how_it_is_known_and_where_it_comes_from(towns, manifest):
     rows = (row(FIRST, "garden", date_known_by="header", source="shelf 1"), row(SECOND, "garden", source="shelf 2"))
     ((_, text),) = propose_regions(manifest(*rows), folders=[towns])
@@ -172,19 +186,27 @@ def test_a_place_of_a_known_region_is_left_out(towns, manifest):
     with reporting(lines.append):
         for again in (row(MILL, "mill"), row(SECOND, "mill"), row(MILL, "other")):
             assert list(propose_regions(manifest(again), folders=[towns], known=[known])) == []
-    assert lines == ["mill: has regions already"] * 2 + ["other: has regions already"]
+    held = f"has regions already: region mill holds {MILL}"
+    assert lines == ["mill: has regions already: region mill"] * 2 + [f"other: {held}"]
 
 
 @pytest.mark.parametrize(
     ("rows", "fault"),
     [
         (
-            [row(MILL, "mill").replace("country", "land")],
-            r"extract.0.country.* is missing|'extract.0.country' is missing",
+            [row(FIRST, "garden"), row(MILL, "mill").replace("country", "land")],
+            r"manifest.toml: extract 2 \(mill-2020-01-01.osm.pbf\): 'country' is missing",
+        ),
+        (
+            [row(FIRST, "garden"), row(MILL, "mill", date="2020-02-30")],
+            r"extract 2 \(mill-2020-01-01.osm.pbf\): 'date' is a day, YYYY-MM-DD, got '2020-02-30'",
         ),
         ([row(MILL, "mill"), row(MILL, "mill", country="Elsewhere")], "two extracts are of one day"),
         ([row(FIRST, "garden"), row(SECOND, "garden", country="E")], "garden lies in E and in Nowhere"),
-        ([row(MILL, "The Mill")], "place"),
+        (
+            [row(MILL, "The Mill")],
+            r"extract 1 \(mill-2020-01-01.osm.pbf\): 'place' has small letters, digits and hyphens between",
+        ),
         ([row(FIRST, "nis"), row(MILL, "nis-2")], "nis-2 may be the name of a second region of nis: rename one"),
         ([""], "'extract' is missing"),
     ],
@@ -207,6 +229,69 @@ def test_of_every_region_one_that_cannot_be_built_costs_no_other(towns, manifest
     assert "garden: not built: garden-2020-01-01.osm.pbf (SHA-256 0000" in err
     assert err.splitlines()[-1].endswith("not built: 1 region (garden) of 2; the lines above say why")
     assert read_manifest(out / "regions" / "mill").id == "mill"
+
+
+def test_a_region_file_that_cannot_be_read_costs_no_other(towns, manifest, program, tmp_path):
+    into, out = tmp_path / "mine", tmp_path / "out"
+    program("propose-regions", manifest(row(MILL, "mill")), "--into", into, "--extracts", towns)
+    (into / "a.toml").write_text("id = 3", encoding="utf-8")
+    code, _, err = program("build-region", "--every", "--region-files", into, "--extracts", towns, "--out", out)
+    assert code == 2
+    assert "a: not built: " in err
+    assert err.splitlines()[-1].endswith("not built: 1 region (a) of 2; the lines above say why")
+    assert read_manifest(out / "regions" / "mill").id == "mill"
+
+
+def test_what_was_made_of_the_same_extracts_is_not_read_again(towns, manifest, program, tmp_path, monkeypatch):
+    into, rows = tmp_path / "mine", [row(FIRST, "garden"), row(SECOND, "garden")]
+    first = program("propose-regions", manifest(*rows), "--into", into, "--extracts", towns)
+    monkeypatch.setattr(proposing, "_houses", None)  # reading it would fail
+    again = program("propose-regions", manifest(*rows), "--into", into, "--extracts", towns)
+    assert (first[0], again[0], again[1]) == (0, 0, "")
+    assert "kept" not in again[2]
+    renamed = [one.replace("garden town", "new words") for one in rows]
+    assert (
+        "garden.toml: kept, although the manifest gives another"
+        in (program("propose-regions", manifest(*renamed), "--into", into, "--extracts", towns)[2])
+    )
+
+
+def test_a_newer_map_of_a_place_is_read(towns, manifest, program, tmp_path):
+    into = tmp_path / "mine"
+    program("propose-regions", manifest(row(FIRST, "garden")), "--into", into, "--extracts", towns)
+    err = program(
+        "propose-regions", manifest(row(FIRST, "garden"), row(SECOND, "garden")), "--into", into, "--extracts", towns
+    )[2]
+    assert "garden.toml: kept, although the manifest gives another" in err
+
+
+def test_an_older_map_of_other_ground_is_left_out_of_the_region_with_a_line(towns, manifest):
+    rows = (row(FIRST, "town"), row(MILL, "town", date="2021-01-01"))  # the mill lies far from the garden
+    lines = []
+    with reporting(lines.append):
+        ((_, text),) = propose_regions(manifest(*rows), folders=[towns])
+    assert [one.file for one in proposing.parse_toml(text, proposing.RegionFile, source="town").extract] == [MILL]
+    assert [line for line in lines if line.startswith("town: without its map of 2015-01-01: ")]
+
+
+def test_a_place_may_have_a_title_and_its_second_region_a_number(towns, manifest):
+    ((_, text),) = propose_regions(manifest(row(MILL, "mill", title="Mühle am Bach")), folders=[towns])
+    assert 'title = "Mühle am Bach, Nowhere: garden town"' in text
+    spec = proposing.parse_toml(text, proposing.RegionFile, source="mill")
+    (listed,) = proposing.read_places(manifest(row(MILL, "old-mill")))["old-mill"]
+    second = proposing._text(
+        "old-mill-2", [listed], spec.extract, centre=spec.center_lonlat, size_m=spec.size_m, scenes=["sparse"]
+    )
+    assert 'title = "Old Mill (2), Nowhere: garden town"' in second
+
+
+def test_origins_that_are_too_long_name_their_commits_in_short():
+    days = [dt.date(year, 1, 1) for year in (2010, 2014, 2016)]
+    texts = {day: f"https://example.org/maps@{number:040x} data/of/a/town.osm.bz2" for number, day in enumerate(days)}
+    stated = proposing._of_dates(texts)
+    assert len(stated) <= LONGEST_LINE
+    assert [part[:10] for part in stated.split("; ")] == [day.isoformat() for day in days]
+    assert "@000000000000 data" in stated
 
 
 def test_a_folder_that_cannot_be_written_into_is_a_line_and_nothing_is_left(towns, manifest, mistake, tmp_path):

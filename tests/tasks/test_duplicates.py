@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ground that two maps share is found wherever it lies and however it is turned; two different places share none."""
+"""Ground that two maps share is found wherever it lies and however it is turned; two different places share none.
+
+Blocks of ten buildings are alike only if their outlines are, each in its place: equal footprints alone are nothing.
+"""
 
 import geopandas as gpd
 import numpy as np
@@ -9,16 +12,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.locate import find_extract
+from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.regions.region_files import read_features
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.tasks.duplicates import (
+    ALIKE_M,
+    BLOCK,
     LEAST_ALIKE,
     LEAST_AREA_M2,
     NEIGHBOURS,
+    Arrangements,
     constellations,
+    find_alike,
     find_duplicate,
+    search_look_alikes,
     search_split,
 )
-from sasgeo_bench.tasks.split import SplitFile, make_split
+from sasgeo_bench.tasks.split import SplitFile, find_split_file, make_split, read_split_file
 
 
 def houses(count=80, *, seed=1, side_m=500.0):
@@ -173,3 +184,129 @@ def test_a_region_that_is_not_built_is_not_searched(copies):
     split = split_of({"a": "train", "b": "train", "c": "test"})
     assert search_split(split, {name: copies[name] for name in "ab"}) == ()
     assert search_split(split, {}) == ()
+
+
+def tract(count=40, *, seed=1, jitter_m=12.0, size_m=(9.0, 12.0), first_id=0):
+    """Equal houses on a street grid, each anywhere on its plot, as a table with ids."""
+    plots = np.indices((-(-count // 5), 5)).reshape(2, -1).T[:count] * 30.0
+    at = plots + np.random.default_rng(seed).uniform(0, jitter_m, (count, 2))
+    outlines = shapely.box(at[:, 0], at[:, 1], at[:, 0] + size_m[0], at[:, 1] + size_m[1])
+    return table(outlines).assign(osm_type="way", osm_id=range(first_id, first_id + count))
+
+
+def moved(features, turn_deg=77.0, shift_m=(40_000.0, 9.0), *, ids_from=1000):
+    outlines = turned(features.geometry, turn_deg, shift_m)
+    return features.assign(geometry=outlines, osm_id=range(ids_from, ids_from + len(features)))
+
+
+def pairs(one, two, **changes):
+    found = find_alike(Arrangements.of(one), Arrangements.of(two), **changes)
+    return set(zip(found.first.tolist(), found.second.tolist(), strict=True))
+
+
+@settings(max_examples=20)
+@given(moves)
+def test_blocks_of_a_copy_are_found_wherever_it_lies_and_however_it_is_turned(move):
+    turn_deg, shift_m, seed = move
+    town = tract(seed=seed)
+    found = find_alike(Arrangements.of(town), Arrangements.of(moved(town, turn_deg, shift_m)))
+    assert len(found.first) >= 39  # of two neighbours that are equally far another may come first by the last bit
+    assert found.apart_m.max() < 1e-3
+
+
+def test_equal_footprints_in_another_arrangement_are_not_alike():
+    assert pairs(tract(seed=1), tract(seed=2, first_id=1000)) == set()
+
+
+def test_an_equal_arrangement_of_other_footprints_is_not_alike():
+    assert pairs(tract(size_m=(9.0, 12.0)), tract(size_m=(12.0, 9.0), first_id=1000)) == set()
+
+
+def test_a_mirrored_copy_is_not_alike():
+    town = tract()
+    mirrored = shapely.transform(town.geometry.to_numpy(), lambda at: at * (-1, 1))
+    assert pairs(town, moved(town.assign(geometry=mirrored))) == set()
+
+
+@pytest.mark.parametrize(("share", "is_found"), [(0.3, True), (1.5, False)])
+def test_blocks_are_alike_up_to_a_tolerance_of_their_outlines(share, is_found):
+    town = tract(BLOCK, jitter_m=8.0)
+    copy = moved(town)
+    shifts = np.random.default_rng(5).choice([-1.0, 1.0], (BLOCK, 2)) * share * ALIKE_M / np.sqrt(2)
+    copy = copy.assign(geometry=[turned([one], 0, by)[0] for one, by in zip(copy.geometry, shifts, strict=True)])
+    assert bool(pairs(town, copy)) is is_found
+
+
+def test_a_block_that_is_copied_into_another_town_is_found_there():
+    block = tract(BLOCK, seed=7, jitter_m=8.0)
+    around = tract(60, seed=8, first_id=500).translate(400.0, 0.0)
+    first = [*block.geometry, *around]
+    second = [*turned(block.geometry, 133.0, (9000.0, 0.0)), *tract(60, seed=9).translate(9400.0, 300.0)]
+    maps = [
+        table(side).assign(osm_type="way", osm_id=range(at, at + len(side))) for side, at in ((first, 0), (second, 99))
+    ]
+    found = pairs(*maps)
+    assert found
+    assert all(one < BLOCK and one == two for one, two in found)
+
+
+def test_a_regular_grid_of_equal_houses_looks_alike_everywhere():
+    grid = tract(60, jitter_m=0.0)
+    inner = {row for row in range(60) if row % 5 == 2 and 10 <= row < 50}
+    assert inner <= {one for one, _ in pairs(grid, moved(grid))}
+
+
+def test_units_that_touch_are_one_building_unless_they_are_taken_as_they_are_drawn():
+    units = shapely.box(np.arange(0, 60, 3.0), 0, np.arange(3, 63, 3.0), 6)
+    garages = table(units).assign(osm_type="way", osm_id=range(20))
+    assert len(Arrangements.of(garages)) == 0
+    one, two = (Arrangements.of(side, as_drawn=True) for side in (garages, moved(garages)))
+    assert len(one) == 20
+    assert len(find_alike(one, two).first) > 0
+
+
+def test_a_row_does_not_lie_over_itself():
+    units = shapely.box(np.arange(0, 60, 5.0), 0, np.arange(3, 63, 5.0), 6)
+    row = table(units).assign(osm_type="way", osm_id=range(12))
+    assert pairs(row, row) == set()  # any two blocks of twelve houses share one
+
+
+def test_fewer_than_ten_buildings_are_no_block():
+    assert len(Arrangements.of(tract(BLOCK - 1))) == 0
+    assert len(Arrangements.of(tract(BLOCK))) == BLOCK
+    assert pairs(tract(BLOCK - 1), tract()) == pairs(tract(), tract(BLOCK - 1)) == set()
+
+
+def test_buildings_with_one_middle_are_in_their_own_blocks():
+    towers = table([shapely.box(-side, -side, side, side).boundary.buffer(0.1) for side in range(2, 26, 2)])
+    found = Arrangements.of(towers.assign(osm_type="way", osm_id=range(12)))
+    assert found.blocks[:, 0].tolist() == list(range(12))
+    assert all(len(set(block)) == BLOCK for block in found.blocks.tolist())
+
+
+def test_look_alikes_of_two_parts_are_named_by_their_blocks_and_those_of_one_part_are_not():
+    town = tract()
+    copies = {"a": town.translate(1300, 1300), "b": town.translate(20_100, 1300), "c": town.translate(40_100, 100)}
+    maps = {
+        name: Arrangements.of(town.assign(geometry=at, osm_id=range(100 * number, 100 * number + 40)))
+        for number, (name, at) in enumerate(copies.items())
+    }
+    (found,) = search_look_alikes(split_of({"a": "train", "b": "train", "c": "test"}), {k: maps[k] for k in "ac"})
+    assert {found.first, found.second} == {"a/0-1", "c/1-0"}
+    assert found.count == 40
+    assert search_look_alikes(split_of({"a": "train", "b": "train"}), maps) == ()
+    assert len(search_look_alikes(split_of({"a": "train", "b": "train", "c": "test"}), maps)) == 2
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_no_block_of_ten_buildings_stands_in_two_parts_of_the_world(real_extracts):
+    spec = read_split_file(find_split_file("world"))
+    regions = {name: read_region_file(list_region_files()[name]) for name in spec.region_ids}
+    maps = {}
+    for name, region in regions.items():
+        extract = region.pick(None)
+        path = find_extract(extract, folders=[real_extracts])
+        maps[name] = Arrangements.of(read_extract(path, region.grid(), at=extract.date).features)
+    assert sum(map(len, maps.values())) > 300_000
+    assert search_look_alikes(make_split(spec, {name: region.grid() for name, region in regions.items()}), maps) == ()

@@ -3,7 +3,7 @@
 
 import hashlib
 import re
-from itertools import combinations
+from itertools import combinations, product
 from typing import get_args
 
 import numpy as np
@@ -278,6 +278,21 @@ def test_one_test_place_of_the_world_in_four_is_sealed_by_the_rule_of_its_file(w
     tests = [place for place in world.spec.place if place.part == "test"]
     order = sorted(tests, key=lambda place: hashlib.sha256(f"sealed/{place.name}".encode()).hexdigest())
     assert {place.name for place in world.spec.place if place.sealed} == {one.name for one in order[: len(tests) // 4]}
+
+
+def test_places_of_the_world_share_no_ground_but_one_pair_of_calibration(world):
+    outlines = {
+        place: [(block.epsg, block.polygon()) for block in blocks] for place, blocks in world.blocks.items() if blocks
+    }
+    shared = {
+        frozenset((one, two))
+        for (one, ours), (two, theirs) in combinations(outlines.items(), 2)
+        if any(
+            epsg == other_epsg and shape.intersection(other).area > 1
+            for (epsg, shape), (other_epsg, other) in product(ours, theirs)
+        )
+    }
+    assert shared == {frozenset({"rapperswil", "rueti"})}  # half a square kilometre of neighbouring towns
 
 
 def test_no_view_of_a_sealed_place_of_the_world_shows_ground_that_is_asked_openly(world):

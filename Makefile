@@ -135,9 +135,9 @@ bench: $(STAMP) ## measure speed and memory (benchmarks/README.md); a report, ne
 	$(VENV_PYTHON) benchmarks/search.py --out $(OUT) $(ARGS)
 	$(VENV_PYTHON) benchmarks/build_region.py $(ARGS)
 
-ageing: $(STAMP) ## measure docs/ageing anew: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS
+ageing: $(STAMP) ## measure docs/ageing, resuming in $(OUT)/ageing: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS
 	@test -n "$(EXTRACTS)" || { echo "name the folder of the extracts: make ageing EXTRACTS=~/osm" >&2; exit 2; }
-	docs/ageing/measure.sh $(abspath $(SASGEO)) "$(EXTRACTS)"
+	$(VENV_PYTHON) docs/ageing/measure.py "$(EXTRACTS)" --out "$(OUT)/ageing"
 
 figures: $(STAMP) ## draw docs/figures anew: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS
 	@test -n "$(EXTRACTS)" || { echo "name the folder of the extracts: make figures EXTRACTS=~/osm" >&2; exit 2; }

@@ -9,7 +9,9 @@ from typing import Final
 
 import pandas as pd
 
-from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, MATCH_IOU, NEAR_M, REDRAWN_M, Ageing
+from sasgeo_bench.ageing.causes import CAUSES
+from sasgeo_bench.ageing.compare import MATCH_IOU, NEAR_M, REDRAWN_M
+from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, Ageing, by_country
 from sasgeo_bench.ageing.plots import draw_ageing
 from sasgeo_bench.ageing.ratebook import VERSION
 from sasgeo_bench.core.errors import ConfigError, StoreError
@@ -25,16 +27,20 @@ _READING: Final = f"""\
 Things are paired by geometry, never by id: areas by an IoU above {MATCH_IOU:g}, or by the ground they share if split or
 merged; lines by the length within {NEAR_M:g} m of a line of the other map. Rates are those of an exponential life whose
 end is known only to lie between two dates, by amount (ground or length), with 95 % intervals from 1,000 draws of blocks
-of 1 km. Ground lost and gained is what the class no longer, or newly, covers, with things that were redrawn, and lines
-in their drawn width. A dash: nothing to measure, or dates less than {LEAST_DAYS} days apart; "all": no bound."""
+of 1 km. "The world" is what changed on the ground: at least what there is evidence for, at most that and what cannot be
+told; in brackets the lower end of the one interval and the upper end of the other. A dash: nothing to measure, or dates
+less than {LEAST_DAYS} days apart; "all": no bound."""
 _READING_SHARES: Final = f"""\
 Rates are over all intervals, shares of the first map against the last: vanished of the older, appeared of the newer, by
-amount and by number (each thing of which more than half did). Re-drawn was kept and moved by more than {REDRAWN_M:g} m
-(areas: their centroid). Retagged: another class of its kind replaced it, or was replaced. Tags attribute part to the
-world (construction, demolished, a start date after the older map) or to mapping that catches up (a start date before);
-the rest is untold (unexplained). Every pair of dates: `{TABLE}`."""
+amount and by number (each thing of which more than half did). Ground lost and gained is what the class no longer, or
+newly, covers, with things that were redrawn, and lines in their drawn width. Re-drawn was kept and moved by more than
+{REDRAWN_M:g} m (areas: their centroid). Causes are shares of what vanished or appeared in all intervals: the world,
+mapping, redrawing out of reach of a pair, retagging, and untold. Every pair of dates: `{TABLE}`."""
 
 _BOTH_WAYS: Final = ("vanished", "vanished_number", "appeared", "appeared_number")
+_COUNTRIES: Final = """\
+Amounts of all places of a country together. Intervals come from draws of its places where there are three or more; of
+two places they reach from the lowest end of their own to the highest, and of one they are its own, from its blocks."""
 _CONTROLS: Final = """\
 Pairs of maps so close in time that almost nothing can have changed. The shares of the amount that vanished, appeared
 are the noise floor of the method: mostly things that only one of the two extracts was cut to hold."""
@@ -46,6 +52,7 @@ def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
         "attribution": ATTRIBUTION,
         "licence": LICENCE,
         "place": ageing.place,
+        "country": ageing.country,
         "sources": list(ageing.sources),
         "area_km2": ageing.area_km2,
     }
@@ -79,7 +86,11 @@ def read_ageing(folder: Path) -> Ageing:
         table = read_frame(path, mend="measure it again")
         facts = table.attrs
         ageing = Ageing(
-            place=facts["place"], sources=tuple(facts["sources"]), area_km2=facts["area_km2"], table=table[list(DTYPES)]
+            place=facts["place"],
+            country=facts["country"],
+            sources=tuple(facts["sources"]),
+            area_km2=facts["area_km2"],
+            table=table[list(DTYPES)],
         )
     except (ValueError, KeyError, TypeError) as error:
         raise StoreError(
@@ -97,27 +108,44 @@ def ageing_text(ageing: Ageing) -> str:
             _READING,
             f"{ageing.area_km2:,.1f} km2 that all of these map:\n\n{sources}",
             _READING_SHARES,
-            _grid(("class", *_RATE_HEAD, *_SHARE_HEAD), _rate_rows(ageing.table, by="class", has_shares=True)),
+            grid(("class", *_RATE_HEAD, *_SHARE_HEAD), _rate_rows(ageing.table, by="class", has_shares=True)),
             f"{ATTRIBUTION}\n",
         )
     )
 
 
-def summary_text(places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> str:
+def summary_text(
+    places: Sequence[Ageing], controls: Sequence[Ageing] = (), *, countries: Sequence[Ageing] | None = None
+) -> str:
     """Format several places as Markdown: the rates of each class, then the result of controls.
+
+    `countries` are the places that figures of countries are made of: all, if it is left out.
 
     Raise `ConfigError` if two places have one name.
     """
     check_names((*places, *controls))
     rows = [_place_cells(place) for place in (*places, *controls)]
-    parts = ["# How maps aged", _READING, _grid(_PLACE_HEAD, rows)]
+    parts = ["# How maps aged", _READING, grid(_PLACE_HEAD, rows)]
+    together_by = by_country(places if countries is None else countries)
+    if len(together_by):
+        parts += [
+            "## By country",
+            _COUNTRIES,
+            grid(
+                ("class", "country", "places", *_RATE_HEAD[2:]),
+                [
+                    [row["class"], row["country"], str(row["places"]), *rate_cells(row)]
+                    for _, row in together_by.iterrows()
+                ],
+            ),
+        ]
     together = _together(places)
     for name in _classes_of(together):
         handset = load_taxonomy()[name].persistence
         rates = (100 * handset.vanish_per_year, 100 * handset.appear_per_year)
         note = f"The taxonomy has, set by hand: vanishes {rates[0]:.2f}, appears {rates[1]:.2f} %/year."
         rows = _rate_rows(together[together["class"] == name], by="place")
-        parts += [f"## {name}", note, _grid(("place", *_RATE_HEAD), rows)]
+        parts += [f"## {name}", note, grid(("place", *_RATE_HEAD), rows)]
     if controls:
         parts += ["## Controls", _CONTROLS, _control_table(controls)]
     return "\n\n".join((*parts, f"{ATTRIBUTION}\n"))
@@ -145,7 +173,7 @@ def _control_table(controls: Sequence[Ageing]) -> str:
     lines = [
         [name, *(_control_cell(table, name) for table in tables.values())] for name in _classes_of(_together(controls))
     ]
-    return _grid(("class", *tables), lines)
+    return grid(("class", *tables), lines)
 
 
 def _control_cell(table: pd.DataFrame, name: str) -> str:
@@ -153,9 +181,15 @@ def _control_cell(table: pd.DataFrame, name: str) -> str:
     return ", ".join("-" if share is None else _percent(share) for share in shares)
 
 
-def write_summary(path: Path, places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> Path:
+def write_summary(
+    path: Path,
+    places: Sequence[Ageing],
+    controls: Sequence[Ageing] = (),
+    *,
+    countries: Sequence[Ageing] | None = None,
+) -> Path:
     """Write `summary_text` into a file, replaced whole; raise `StoreError` if it cannot be written."""
-    text = summary_text(places, controls)
+    text = summary_text(places, controls, countries=countries)
     return replace_file(path, lambda scratch: scratch.write_text(text, encoding="utf-8"))
 
 
@@ -168,13 +202,14 @@ def _place_cells(ageing: Ageing) -> list[str]:
 
 
 _RATE_HEAD: Final = (
-    *("first amount", "last amount", "vanishes, %/year", "appears, %/year"),
-    *("ground lost, %/year", "ground gained, %/year"),
+    *("first amount", "last amount", "vanishes, %/year", "of it the world, %/year"),
+    *("appears, %/year", "of it the world, %/year"),
 )
 _SHARE_HEAD: Final = (
+    *("ground lost, %/year", "ground gained, %/year"),
     *("vanished, amount", "vanished, number", "appeared, amount", "appeared, number"),
     *("re-drawn, amount", "ids gone, number"),
-    *("of vanished: world, retagged, untold", "of appeared: world, catch-up, retagged, untold"),
+    *(f"of {what}: {', '.join(CAUSES)}" for what in ("vanished", "appeared")),
 )
 
 
@@ -188,14 +223,32 @@ def _rate_rows(table: pd.DataFrame, *, by: str, has_shares: bool = False) -> lis
             str(name),
             _amount(share["amount_from"], share["unit"]),
             _amount(share["amount_to"], share["unit"]),
-            *(_rate(rate, column) for column in _RATEBOOK_RATES),
+            *rate_cells(rate),
         ]
         if has_shares:
+            row += [_rate(rate, f"{what}_per_year") for what in ("ground_lost", "ground_gained")]
             row += [_percent(share[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "id_vanished")]
-            row.append(_shares(rate, "vanished", ("world", "retagged", "untold")))
-            row.append(_shares(rate, "appeared", ("world", "catch_up", "retagged", "untold")))
+            row += [_shares(rate, what, CAUSES) for what in ("vanished", "appeared")]
         rows.append(row)
     return rows
+
+
+def rate_cells(rate: pd.Series) -> list[str]:
+    """Format what vanishes, what of it is the world, and the same of what appears, in percent a year."""
+    return [
+        cell
+        for what in ("vanish", "appear")
+        for cell in (_rate(rate, f"{what}_per_year"), _between(rate, f"{what}_least_per_year", f"{what}_most_per_year"))
+    ]
+
+
+def _between(row: pd.Series, least: str, most: str) -> str:
+    """Format `0.14 to 0.26 (0.10 to 0.35)`, in percent."""
+    low, high, lo, hi = (100 * row[name] for name in (least, most, f"{least}_lo", f"{most}_hi"))
+    if pd.isna(low) or pd.isna(high):
+        return "-"
+    known = "" if pd.isna(lo) or pd.isna(hi) else f" ({lo:.2f} to {_bounded(hi)})"
+    return f"{_bounded(low)} to {_bounded(high)}{known}"
 
 
 def _amount(value: float, unit: str) -> str:
@@ -224,7 +277,8 @@ def _bounded(percent: float) -> str:
     return "all" if math.isinf(percent) else f"{percent:.2f}"
 
 
-def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Format a Markdown table."""
     lines = [map(markdown, head), ["---"] * len(head), *(map(markdown, row) for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -237,19 +291,25 @@ attribution = {quoted(ATTRIBUTION)}
 licence = {quoted(LICENCE)}
 """
 _RATEBOOK_COUNTS: Final = ("n_from", "n_to")
-_RATEBOOK_RATES: Final = ("vanish_per_year", "appear_per_year", "ground_lost_per_year", "ground_gained_per_year")
-_RATEBOOK_SHARES: Final = ("redrawn_share", "shift_median_m", "shift_p90_m")
+_RATEBOOK_RATES: Final = tuple(
+    f"{what}{of}_per_year" for what in ("vanish", "appear") for of in ("", "_least", "_most")
+)
+_RATEBOOK_SHARES: Final = ("redrawn_share", "shift_median_m")
 
 
 def ratebook_text(places: Sequence[Ageing]) -> str:
-    """Format several places as TOML; raise `ConfigError` if two have one name."""
+    """Format several places as TOML; raise `ConfigError` if two have one name, or one has no country."""
     check_names(places)
+    homeless = [place.place for place in places if not place.country]
+    if homeless:
+        raise ConfigError(f"the country of {homeless[0]!r} is unknown: measure it again with --country")
     parts = [_RATEBOOK_HEAD if places else f"{_RATEBOOK_HEAD}place = []\n"]
     for place in places:
         files = dict.fromkeys(source.rpartition(" of ")[0] for source in place.sources)
         lines = [
             "[[place]]",
             f"name = {quoted(place.place)}",
+            f"country = {quoted(place.country)}",
             f"area_km2 = {place.area_km2!r}",
             f"extracts = [{', '.join(map(quoted, files))}]",
         ]
@@ -264,11 +324,20 @@ def _ratebook_class(name: str, pooled: pd.Series, whole: pd.Series) -> str:
     lines += [f"{column} = {int(pooled[column])}" for column in _RATEBOOK_COUNTS]
     for column in _RATEBOOK_RATES:
         ends = {"best": pooled[column], "lo": pooled[f"{column}_lo"], "hi": pooled[f"{column}_hi"]}
-        known = [f"{end} = {float(value)!r}" for end, value in ends.items() if not pd.isna(value)]
+        known = [f"{end} = {_short(value)}" for end, value in ends.items() if not pd.isna(value)]
         if known:
             lines.append(f"{column} = {{ {', '.join(known)} }}")
-    lines += [f"{column} = {float(whole[column])!r}" for column in _RATEBOOK_SHARES if not pd.isna(whole[column])]
+    for what in ("vanished", "appeared"):
+        shares = {cause: pooled[f"{what}_{cause}_share"] for cause in CAUSES}
+        if not any(map(pd.isna, shares.values())):
+            told = ", ".join(f"{cause} = {_short(share)}" for cause, share in shares.items())
+            lines.append(f"{what} = {{ {told} }}")
+    lines += [f"{column} = {_short(whole[column])}" for column in _RATEBOOK_SHARES if not pd.isna(whole[column])]
     return "\n".join(lines) + "\n"
+
+
+def _short(value: float) -> str:
+    return repr(round(float(value), 5))
 
 
 def write_ratebook(path: Path, places: Sequence[Ageing]) -> Path:

@@ -13,9 +13,8 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from sasgeo_bench.core.config import Document, parse_toml
-from sasgeo_bench.core.errors import ConfigError
 
-VERSION: Final = 2  # of the file: 1 had no rates of ground
+VERSION: Final = 3  # of the file: 1 and 2 knew neither countries nor causes
 LEAST_THINGS: Final = 20  # a rate of fewer things is too uncertain
 _BEFORE_DATE: Final = re.compile(r"^(.+?)[-_.]*\d{4}-\d{2}-\d{2}")
 
@@ -35,28 +34,33 @@ class Estimate(Document):
 class ClassAgeing(Document):
     """Measurements of one class in one place over a number of years; None if there was nothing to measure.
 
-    Rates are those over all intervals: `vanish` and `appear` count things, `ground_lost` and `ground_gained` what the
-    class no longer, or newly, covers, so they hold what was redrawn too. `redrawn_share` (of the older amount) and the
-    shifts compare the first map with the last. The shift of an area is that of its centroid, so it means nothing where
-    areas grow: green, farmland, water.
+    Rates are those over all intervals: of all that vanishes or appears, of what is told to be the world's (`least`),
+    and of that and what cannot be told (`most`); `vanished` and `appeared` are the shares of each cause
+    (`sasgeo_bench.ageing.causes`). `redrawn_share` (of the older amount) and the median shift compare the first map
+    with the last. The shift of an area is that of its centroid, so it means nothing where areas grow: green, farmland,
+    water.
     """
 
     years: Annotated[float, Field(gt=0)]
     n_from: Count
     n_to: Count
     vanish_per_year: Estimate | None = None
+    vanish_least_per_year: Estimate | None = None
+    vanish_most_per_year: Estimate | None = None
     appear_per_year: Estimate | None = None
-    ground_lost_per_year: Estimate | None = None
-    ground_gained_per_year: Estimate | None = None
+    appear_least_per_year: Estimate | None = None
+    appear_most_per_year: Estimate | None = None
+    vanished: dict[str, Share] = {}
+    appeared: dict[str, Share] = {}
     redrawn_share: Share | None = None
     shift_median_m: NotNegative | None = None
-    shift_p90_m: NotNegative | None = None
 
 
 class PlaceAgeing(Document):
-    """Measurements of one place, and the extracts they come from."""
+    """Measurements of one place, its country as the splits name it, and the extracts they come from."""
 
     name: str
+    country: str
     area_km2: NotNegative
     extracts: list[str]
     classes: dict[str, ClassAgeing] = Field(alias="class")
@@ -84,17 +88,22 @@ class RateBook(Document):
         """Return the names of the places."""
         return tuple(place.name for place in self.places)
 
+    @property
+    def countries(self) -> tuple[str, ...]:
+        """Return the countries of the places, each once."""
+        return tuple(dict.fromkeys(place.country for place in self.places))
+
     def __getitem__(self, name: str) -> PlaceAgeing:
         """Return the place of that name; `KeyError` if there is none."""
         return {place.name: place for place in self.places}[name]
 
-    def place_of(self, extract: str) -> str | None:
-        """Return the place measured from extracts like this file, or None.
+    def country_of(self, extract: str) -> str | None:
+        """Return the country of the place that was measured from extracts like this file, or None.
 
         Files are alike if their names are the same up to the date: rates from Liechtenstein are Vaduz's own.
         """
         stem = _stem(extract)
-        return next((place.name for place in self.places if stem in map(_stem, place.extracts)), None)
+        return next((place.country for place in self.places if stem in map(_stem, place.extracts)), None)
 
 
 def _stem(file: str) -> str:
@@ -104,83 +113,61 @@ def _stem(file: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PooledClass:
-    """Rates of one class from several places, 1/year, and how it is re-drawn; None if no place has a value.
-
-    Rates of ground are those of things and of what was redrawn. `redrawn_share` is of the amount `years` before; both
-    are medians, as are the shifts in metres.
-    """
+    """Yearly rates at which the world changes in one class, 1/year: the most that several countries leave room for."""
 
     vanish_per_year: float
     appear_per_year: float
-    ground_lost_per_year: float
-    ground_gained_per_year: float
-    years: float
-    redrawn_share: float | None
-    shift_median_m: float | None
-    shift_p90_m: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PooledRates:
-    """Rates by class, and the places they come from."""
+    """Rates by class, and the countries they come from."""
 
     classes: Mapping[str, PooledClass]
-    places: tuple[str, ...]
+    countries: tuple[str, ...]
 
 
 def pool_rates(book: RateBook, *, exclude: Collection[str] = ()) -> PooledRates:
-    """Pool the rates of all places but those excluded: a place must not be aged by its own measurements.
+    """Pool the rates of the world's change over all countries but those excluded.
 
-    `RateBook.place_of` gives the place of an extract. A place with fewer than `least_things` of a class, on the first
-    map for what vanishes and on the last for what appears, is not used for that rate; a class without both rates is
-    left out. Raise `ConfigError` if an excluded place is not in the book: a misspelt name would let its rates in.
+    A place must not be aged by what was measured in it, nor by its neighbours: exclude its country, which
+    `RateBook.country_of` gives for a measured extract. A country that was not measured may be named, too.
 
     Notes
     -----
-    The median, not a mean weighted by amount: places differ by far more than the interval of any one of them, so each
-    is one sample of how maps age, and one import must not set the rate of all.
+    The rates are `vanish_most_per_year` and `appear_most_per_year`: what is the world's, and what cannot be told.
+    What was mapped late, redrawn or retagged is no change of the world. A place with fewer than `LEAST_THINGS` of a
+    class, on the first map for what vanishes and on the last for what appears, is not used for that rate, and neither
+    is a rate without bound; a class without both rates is left out. The rate of a country is the median of its places,
+    the pooled rate the median of the countries: they differ by far more than the interval of any one of them, so each
+    is one sample, and one import must not set the rate of all.
     """
-    unknown = sorted(set(exclude) - set(book.names))
-    if unknown:
-        raise ConfigError(
-            f"there is no place {unknown[0]!r} to leave out of the ageing rates; known: {', '.join(book.names)}"
-        )
-    places = [place for place in book.places if place.name not in exclude]
+    places = [place for place in book.places if place.country not in exclude]
     names = dict.fromkeys(name for place in places for name in place.classes)
-    pooled = {name: _pooled([place.classes[name] for place in places if name in place.classes]) for name in names}
+    pooled = {name: _pooled(name, places) for name in names}
     return PooledRates(
         classes={name: item for name, item in pooled.items() if item is not None},
-        places=tuple(place.name for place in places),
+        countries=tuple(dict.fromkeys(place.country for place in places)),
     )
 
 
-def _pooled(found: Sequence[ClassAgeing]) -> PooledClass | None:
-    olds = [item for item in found if item.n_from >= LEAST_THINGS]
-    news = [item for item in found if item.n_to >= LEAST_THINGS]
-    sides = {"vanish": olds, "appear": news, "ground_lost": olds, "ground_gained": news}
-    rates = {f"{what}_per_year": _median_rate(side, f"{what}_per_year") for what, side in sides.items()}
-    if not all(map(math.isfinite, rates.values())):
+def _pooled(name: str, places: Sequence[PlaceAgeing]) -> PooledClass | None:
+    found = [(place.country, place.classes[name]) for place in places if name in place.classes]
+    vanish = [(at, item.vanish_most_per_year) for at, item in found if item.n_from >= LEAST_THINGS]
+    appear = [(at, item.appear_most_per_year) for at, item in found if item.n_to >= LEAST_THINGS]
+    rates = [_median_rate(side) for side in (vanish, appear)]
+    if not all(map(math.isfinite, rates)):
         return None
-    redrawn = [item for item in olds if item.redrawn_share is not None]
-    return PooledClass(
-        **rates,
-        years=float(np.median([item.years for item in redrawn or olds])),
-        redrawn_share=_median([item.redrawn_share for item in olds]),
-        shift_median_m=_median([item.shift_median_m for item in olds]),
-        shift_p90_m=_median([item.shift_p90_m for item in olds]),
-    )
+    return PooledClass(vanish_per_year=rates[0], appear_per_year=rates[1])
 
 
-def _median_rate(found: Sequence[ClassAgeing], name: str) -> float:
-    """Return the median of the best estimates of a rate; NaN if no place has one."""
-    known: list[Estimate | None] = [getattr(item, name) for item in found]
-    best = _median([rate.best for rate in known if rate is not None])
-    return math.nan if best is None else best
-
-
-def _median(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
+def _median_rate(found: Sequence[tuple[str, Estimate | None]]) -> float:
+    """Return the median over countries of the median of each; NaN if no place has a rate."""
+    by_country: dict[str, list[float]] = {}
+    for country, rate in found:
+        if rate is not None and math.isfinite(rate.best):
+            by_country.setdefault(country, []).append(rate.best)
+    return float(np.median([np.median(own) for own in by_country.values()])) if by_country else math.nan
 
 
 PACKAGED: Final = "ratebook.toml"

@@ -191,7 +191,9 @@ def rate_table(book: RateBook) -> Table:
         (column("years"), lambda row: _short_cell(row[2].years)),
         (column("things"), lambda row: Cell(text=f"{row[2].n_from} to {row[2].n_to}", key=float(row[2].n_from))),
         (column("vanishes", title="vanishes (%/year)"), lambda row: _rate_cell(row[2].vanish_per_year)),
+        (column("world", title="of it the world, at most"), lambda row: _rate_cell(row[2].vanish_most_per_year)),
         (column("appears", title="appears (%/year)"), lambda row: _rate_cell(row[2].appear_per_year)),
+        (column("world", title="of it the world, at most"), lambda row: _rate_cell(row[2].appear_most_per_year)),
         (column("re-drawn", title="re-drawn (%)"), lambda row: _short_cell(row[2].redrawn_share, per=100)),
         (column("moved", title="moved (m)"), lambda row: _short_cell(row[2].shift_median_m)),
     )
@@ -211,32 +213,37 @@ def _short_cell(value: float | None, *, per: int = 1) -> Cell:
 
 
 _RATES: Final = (0.05, 100.0)  # % a year; what lies beyond is drawn at the edge
-_STEP: Final = 0.13  # between two places of a class
+_STEP: Final = 0.12  # between two countries of a class
 
 
 def draw_rates(path: Path, book: RateBook) -> None:
-    """Draw into a .svg or .png what vanishes and what appears in a year, by class, a mark for each measured place."""
+    """Draw into a .svg or .png how fast the world changes at most, by class, with a mark for each country."""
     titles = {item.name: item.title for item in load_taxonomy().classes}
     names = [name for name in titles if any(name in place.classes for place in book.places)]
     about = BoardPage(
-        title=f"How fast maps grow old: {len(book.places)} places",
-        note="Bars: 95 % intervals, from blocks of 1 km. Rates beyond the scale lie at its edge. What appears is "
-        "mostly mapping that catches up. How many things each rate is of stands in the table.",
+        title=f"How fast the world changes at most: {len(book.places)} places in {len(book.countries)} countries",
+        note="What is told to be the world's, and what cannot be told; late mapping, redrawing and retagging left out. "
+        "Marks: medians of a country's places. Bars: from the lowest to the highest place. Rates beyond the scale lie "
+        "at its edge.",
         below="per cent a year",
         columns=2,
-        panel_inches=(3.1, 0.3 + 0.29 * len(names)),
-        keys=line_keys(book.names),
+        panel_inches=(3.1, 0.3 + 0.35 * len(names)),
+        keys=line_keys(book.countries),
     )
     with page(path, about) as charts:
         for chart, (column, title) in zip(
             charts[0],
-            (("vanish_per_year", "vanishes, of the older map"), ("appear_per_year", "appears, of the newer map")),
+            (
+                ("vanish_most_per_year", "vanishes, of the older map"),
+                ("appear_most_per_year", "appears, of the newer map"),
+            ),
             strict=True,
         ):
             for at, name in enumerate(names):
-                for number, place in enumerate(book.places):
-                    y = at + _STEP * (number - (len(book.places) - 1) / 2)
-                    _draw_rate(chart, getattr(place.classes.get(name), column, None), y=y, look=look_of(number))
+                for number, country in enumerate(book.countries):
+                    y = at + _STEP * (number - (len(book.countries) - 1) / 2)
+                    found = [place.classes.get(name) for place in book.places if place.country == country]
+                    _draw_rate(chart, [getattr(item, column, None) for item in found], y=y, look=look_of(number))
             chart.set_title(title)
             chart.set_xscale("log")
             chart.set_xlim(_RATES[0] * 0.8, _RATES[1] * 1.2)
@@ -248,13 +255,12 @@ def draw_rates(path: Path, book: RateBook) -> None:
         charts[0][1].set_yticklabels([])
 
 
-def _draw_rate(chart: Axes, rate: Estimate | None, *, y: float, look: Look) -> None:
-    if rate is None:
+def _draw_rate(chart: Axes, rates: Sequence[Estimate | None], *, y: float, look: Look) -> None:
+    known = np.clip([100 * rate.best for rate in rates if rate is not None], *_RATES)
+    if len(known) == 0:
         return
-    ends = [float(np.clip(100 * one, *_RATES)) for one in (rate.lo, rate.hi) if one is not None]
-    if len(ends) > 1:
-        chart.hlines(y, ends[0], ends[1], color=look.colour, lw=0.9)
-    chart.plot(float(np.clip(100 * rate.best, *_RATES)), y, marker=look.mark, ms=3.2, color=look.colour, ls="")
+    chart.hlines(y, known.min(), known.max(), color=look.colour, lw=0.9)
+    chart.plot(float(np.median(known)), y, marker=look.mark, ms=3.2, color=look.colour, ls="")
 
 
 # --- the page with the answers ---

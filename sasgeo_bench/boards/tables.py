@@ -408,6 +408,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "things": "Things of the class on the first map and on the last",
     "vanishes": "Share of what the map shows that is gone after a year, with its 95 % interval, over all dates",
     "appears": "Share of a newer map that one a year older lacks, with its 95 % interval; late mapping is in it",
+    "world": "Of what vanishes or appears in a year: what is told to be a change of the world, and what cannot be told",
     "re-drawn": "Of the older amount: kept, but moved by more than 1 m between the first map and the last",
     "moved": "How far what was kept moved, median; of areas that of the centroid",
     "no.": "As on the map above",

@@ -27,6 +27,7 @@ class AgeingOptions(Options):
         list[str] | None, typer.Option(help="YYYY-MM-DD: of each extract in order, or to cut a full history at")
     ] = None
     place: Annotated[str | None, typer.Option(help="name of the place; default: how the first file begins")] = None
+    country: Annotated[str, typer.Option(help="its country, for --rates: places are aged by rates of others")] = ""
     bounds: Annotated[str | None, typer.Option(metavar="W,S,E,N", help="degrees; default: what all map")] = None
     margin_m: Annotated[
         float, typer.Option(min=0, help="cut off along the edges of extracts where those are estimated, metres")
@@ -70,7 +71,7 @@ def measure_ageing_command(options: AgeingOptions) -> None:
     dated = date_extracts(options.extract, at=[read_day(text, flag="--at") for text in options.at or ()])
     history = read_history(dated, bounds=box, margin_m=options.margin_m)
     name = options.place or options.extract[0].name.split(".")[0].split("-")[0]
-    for path in write_ageing(out, measure_ageing(history, place=name)):
+    for path in write_ageing(out, measure_ageing(history, place=name, country=options.country)):
         say(path)
 
 
@@ -80,6 +81,7 @@ def _compare(options: AgeingOptions) -> None:
         "--extract": options.extract,
         "--at": options.at,
         "--place": options.place,
+        "--country": options.country,
         "--bounds": options.bounds,
         "--margin-m": options.margin_m != MARGIN_M,
     }

@@ -229,7 +229,7 @@ def read_scene(request: Request, suite: Suite) -> tuple[Scene, Region]:
         others=others,
         elsewhere=elsewhere,
         imagery=imagery if "imagery" in needs else None,
-        ageing=_ageing(request.region) if "rates of ageing" in needs else None,
+        ageing=_ageing(request.region, request.split) if "rates of ageing" in needs else None,
         looks={block.id: look_of(request.split, block) for block in blocks} if suite.is_pictured else {},
         profile=request.choice.profile,
     )
@@ -246,10 +246,12 @@ def look_of(split: Split, block: Block) -> Family:
     return split.folds[0].part_of[place]
 
 
-def _ageing(spec: RegionFile) -> Ageing:
+def _ageing(spec: RegionFile, split: Split) -> Ageing:
+    """Return the rates of other countries: of a region's own, its extract, its provenance or its split tells."""
     book = load_ratebook()
-    place = book.place_of(spec.pick(None).file)
-    return ageing_of(pool_rates(book, exclude=[place] if place else []), place=place or spec.id)
+    told = [book.country_of(spec.pick(None).file), (spec.provenance.country or "").lower().replace(" ", "-")]
+    own = {*filter(None, told), *(split.country_of[place] for place in split.places_in(spec.id))}
+    return ageing_of(pool_rates(book, exclude=own), place=spec.id)
 
 
 def _built(request: Request, spec: RegionFile, date: dt.date | None) -> Path:

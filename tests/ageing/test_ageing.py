@@ -13,21 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.ageing import measure
-from sasgeo_bench.ageing.files import read_ageing, summary_text, write_ageing
-from sasgeo_bench.ageing.measure import DTYPES as COLUMNS
-from sasgeo_bench.ageing.measure import (
-    bootstrap_rate,
+from sasgeo_bench.ageing.compare import (
     compare_areas,
     compare_pieces,
     covered_share,
     cut_to,
-    loss_rate,
     make_areas,
     make_pieces,
-    measure_ageing,
     polygons_of,
-    seeded_rng,
 )
+from sasgeo_bench.ageing.files import read_ageing, summary_text, write_ageing
+from sasgeo_bench.ageing.measure import DTYPES as COLUMNS
+from sasgeo_bench.ageing.measure import bootstrap_rate, loss_rate, measure_ageing, seeded_rng
 from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.osm.history import History, Lifecycle, ObjectKey, Span, State
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -228,7 +225,7 @@ def test_start_dates_and_building_sites_tell_new_houses_from_late_mapping():
     found = row(measured(state(OLD, new[4:], before), state(NEW, new, after)), "building")
     assert found["appeared_share"] == 0.8
     assert found["appeared_world_share"] == 0.5  # the site's, and that of 2017
-    assert found["appeared_catch_up_share"] == 0.25
+    assert found["appeared_mapping_share"] == 0.25
     assert found["appeared_untold_share"] == 0.25  # begun between 2010 and 2019: before or after the older map
 
 

@@ -266,7 +266,7 @@ def test_the_drawings_of_a_site_say_what_they_show_and_whose_data_it_is(tmp_path
     assert {"1", "2", "3", "half a", "half b", "no part", "all places (n = 3)", "those in Europe (n = 2)"} <= {
         *texts["places.svg"]
     }
-    assert {"Liechtenstein", "building", "vanishes, of the older map", "0.1"} <= {*texts["rates.svg"]}
+    assert {"liechtenstein", "building", "vanishes, of the older map", "0.1"} <= {*texts["rates.svg"]}
     for found in texts.values():
         assert "Data: (c) OpenStreetMap contributors, ODbL" in found
 

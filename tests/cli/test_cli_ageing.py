@@ -38,7 +38,9 @@ def test_three_files_are_written_and_named(program, towns, tmp_path):
 
 def test_places_are_put_beside_each_other(program, towns, tmp_path):
     for place in ("north", "south"):
-        assert program("measure-ageing", *extracts(towns[::2]), "--place", place, "--out", place)[0] == 0
+        assert (
+            program("measure-ageing", *extracts(towns[::2]), "--place", place, "--country", "x", "--out", place)[0] == 0
+        )
     code, out, err = program("measure-ageing", "--compare", "north", "south", "--out", "both.md")
     assert code == 0, err
     assert out.strip() == "both.md"

@@ -244,7 +244,7 @@ def test_a_house_replaced_by_a_site_and_a_site_replaced_by_a_house_are_the_world
     row = found(read_history(date_extracts([new, old])))
     assert (row["vanished_share"], row["vanished_world_share"]) == (pytest.approx(0.5, abs=1e-3), 1.0)
     assert row["appeared_world_share"] == pytest.approx(0.5, abs=1e-3)
-    assert row["appeared_catch_up_share"] == pytest.approx(0.5, abs=1e-3)
+    assert row["appeared_mapping_share"] == pytest.approx(0.5, abs=1e-3)
     assert row["appeared_untold_share"] == pytest.approx(0.0, abs=1e-6)
 
 

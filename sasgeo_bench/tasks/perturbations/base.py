@@ -228,17 +228,6 @@ def resample(evidence: Evidence, right_m: Metres, up_m: Metres) -> Evidence:
     return evidence.replace(cells, _take(evidence.confidence, places, within, 0))
 
 
-def shifted(layer: NDArray[Value], rows: int, cols: int, *, beyond: int) -> NDArray[Value]:
-    """Move a layer down and right by whole cells; cells from outside the view get the value `beyond`."""
-    height, width = layer.shape
-    out = np.full_like(layer, beyond)
-    if abs(rows) < height and abs(cols) < width:
-        out[max(rows, 0) : height + min(rows, 0), max(cols, 0) : width + min(cols, 0)] = layer[
-            max(-rows, 0) : height + min(-rows, 0), max(-cols, 0) : width + min(-cols, 0)
-        ]
-    return out
-
-
 def _take(
     stack: NDArray[np.uint8], places: NDArray[np.intp], within: NDArray[np.bool_], beyond: int
 ) -> NDArray[np.uint8]:

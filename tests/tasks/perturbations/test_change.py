@@ -10,7 +10,7 @@ from sasgeo_bench.core.errors import PerturbError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
-from sasgeo_bench.tasks.perturbations.base import find_objects, pick_up_to, shifted
+from sasgeo_bench.tasks.perturbations.base import find_objects, pick_up_to
 from sasgeo_bench.tasks.perturbations.season import Season
 
 
@@ -98,46 +98,6 @@ def test_roads_go_and_come_in_pieces(views):
     assert np.std(kept) > 0.05  # pieces, not a thinning of everything
 
 
-def ground(lost=0.0, gained=0.0, names=("building",), vanish=0.0):
-    item = Rates(vanish_per_year=vanish, appear_per_year=0.0, ground_lost_per_year=lost, ground_gained_per_year=gained)
-    return dict.fromkeys(names, item)
-
-
-@pytest.mark.parametrize("vanish", [0.0, 0.01, 0.03])
-def test_as_much_ground_is_lost_as_the_rate_says_however_much_of_it_vanishes(vanish):
-    village = houses()
-    before = village.layer("building") == PRESENT
-    views = aged(village, rates=ground(lost=0.03, vanish=vanish), years=10, shift_m=1.5)
-    kept = [((view.layer("building") == PRESENT) & before).sum() / before.sum() for view in views]
-    assert np.mean(kept) == pytest.approx(np.exp(-0.3), abs=0.03)
-    assert np.mean([count(view) for view in views]) == pytest.approx(64 * np.exp(-10 * vanish), rel=0.06)
-
-
-def test_shifts_too_small_to_lose_the_ground_are_doubled():
-    village = houses()
-    before = village.layer("building") == PRESENT
-    for shift_m in (0.6, 4.0):
-        views = aged(village, rates=ground(lost=0.06), years=10, shift_m=shift_m)
-        kept = np.mean([((view.layer("building") == PRESENT) & before).sum() / before.sum() for view in views])
-        assert kept == pytest.approx(np.exp(-0.6), abs=0.06)
-
-
-def test_redrawing_gains_ground_too_and_new_houses_the_rest():
-    village = houses(per_side=4)
-    before = village.layer("building") == PRESENT
-    for lost, gained in ((0.0, 0.03), (0.02, 0.03), (0.02, 0.0)):
-        views = [view.layer("building") == PRESENT for view in aged(village, rates=ground(lost, gained), years=10)]
-        new = np.mean([(view & ~before).sum() / view.sum() for view in views])
-        redrawn = 1 - np.exp(-10 * lost)  # as much as is lost, and no less
-        assert new == pytest.approx(max(1 - np.exp(-10 * gained), redrawn), abs=0.03)
-
-
-def test_what_is_redrawn_at_the_edge_goes_on_beyond_it():
-    lawn = houses(per_side=0, green=1)
-    for after in aged(lawn, rates=ground(lost=0.1, names=("green",)), years=10, seeds=range(3)):
-        assert (after.layer("green") == PRESENT).all()
-
-
 def test_a_place_is_never_aged_by_its_own_rates():
     with pytest.raises(PerturbError, match="the rates come from 'vaduz' itself, take those of other places"):
         Ageing(years=5, rates=rates(), place="vaduz", measured_in=("triesen", "vaduz"))
@@ -146,16 +106,6 @@ def test_a_place_is_never_aged_by_its_own_rates():
 def test_rates_that_are_none_are_refused():
     with pytest.raises(PerturbError, match="vanish_per_year lies between"):
         rates(vanish=-1.0)
-
-
-@given(rows=st.integers(-12, 12), cols=st.integers(-12, 12))
-def test_shifting_a_mask_is_rolling_it_without_what_comes_round(rows, cols):
-    mask = np.random.default_rng(0).random((9, 7)) < 0.5
-    wide = np.zeros((49, 47), dtype=bool)
-    wide[20:29, 20:27] = mask
-    np.testing.assert_array_equal(
-        shifted(mask, rows, cols, beyond=False), np.roll(wide, (rows, cols), axis=(0, 1))[20:29, 20:27]
-    )
 
 
 @given(budget=st.floats(0, 100), seed=st.integers(0, 999))

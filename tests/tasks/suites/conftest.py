@@ -19,7 +19,7 @@ from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.tasks import flight_sampling
 from sasgeo_bench.tasks.flight_sampling import Airspace, Flight, FlightDrawer, rows
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, rates_by_hand
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.split import blocks_of, find_split
 from sasgeo_bench.tasks.state import State
@@ -98,16 +98,6 @@ class Carried:
         )
 
 
-def _with_ground(rates: dict[str, Rates]) -> dict[str, Rates]:
-    """Rates whose ground is lost three times as fast as things vanish, and gained half as fast again as they appear."""
-    return {
-        name: replace(
-            item, ground_lost_per_year=3 * item.vanish_per_year, ground_gained_per_year=1.5 * item.appear_per_year
-        )
-        for name, item in rates.items()
-    }
-
-
 def _view_reach_m(suite: Suite) -> float:
     """How far from its centre a view of a suite may show anything."""
     return max(item.side_m for item in suite.variants) / 2 * 2**0.5 * largest_scale(suite.card.group)
@@ -166,7 +156,7 @@ def scene(town) -> Callable[..., Scene]:
             scenes=town(name).manifest.scenes,
             others=tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER) if name in DATED else (),
             elsewhere=State.of(town("town-riverside")),
-            ageing=Ageing(years=0.0, rates=_with_ground(rates_by_hand()), place="here"),
+            ageing=Ageing(years=0.0, rates=rates_by_hand(), place="here"),
             looks={block.id: "train" for block in blocks_of(state.region, state.grid)},
         )
 

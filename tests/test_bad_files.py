@@ -207,7 +207,7 @@ def make_board(folder: Path, _: TinyPlace) -> None:
 
 def make_ageing(folder: Path, _: TinyPlace) -> None:
     table = pd.DataFrame({name: pd.Series([], dtype=kind) for name, kind in DTYPES.items()})
-    values = {"place": "here", "sources": ["a of 2020-01-01"], "area_km2": 1.0}
+    values = {"place": "here", "country": "nowhere", "sources": ["a of 2020-01-01"], "area_km2": 1.0}
     write_frame(table, folder / "ageing.parquet", attrs=values)
 
 

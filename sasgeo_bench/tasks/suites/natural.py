@@ -354,7 +354,7 @@ class NaturalSuite(Suite):
         margin = 1.0 - twin.likeness
         return replace(
             draft,
-            strength=round(math.ceil(margin / STEP - 1e-6) * STEP, 2),
+            strength=round(max(1, math.ceil(margin / STEP - 1e-6)) * STEP, 2),
             measured={"margin": round(margin, 4), "twin_rank": float(twin.rank), TWIN_TURN: twin.turn_deg}
             | draft.measured,
         )

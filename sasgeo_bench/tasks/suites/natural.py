@@ -248,12 +248,15 @@ def _place(point: Points) -> Place:
 
 
 def own_likeness(state: State, place_m: Place, side_m: float) -> float:
-    """Return how alike a view is to its own ground seen `NEAR_M` to 48 m beside it, the likest way; 0..1."""
-    half, reach = round(side_m / 2 / _COARSE_M), round(_OWN_REACH_M / _COARSE_M)
-    around = _Shares.of(state, place_m, (half + reach) * _COARSE_M, _COARSE_M)
+    """Return how alike a view is to its own ground seen `NEAR_M` to 48 m beside it, the likest way; 0..1.
+
+    In the cells in which a pair is measured: in coarser ones a view is less like its own ground.
+    """
+    half, reach = round(side_m / 2 / _FINE_M), round(_OWN_REACH_M / _FINE_M)
+    around = _Shares.of(state, place_m, (half + reach) * _FINE_M, _FINE_M)
     found = likeness(around.middle(half), around)
-    rows, cols = np.mgrid[-reach : reach + 1, -reach : reach + 1] * _COARSE_M
-    return float(found[np.hypot(rows, cols) >= NEAR_M].max())
+    off_m = np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) * _FINE_M
+    return float(found[(off_m >= NEAR_M) & (off_m <= _OWN_REACH_M)].max())
 
 
 def align(state: State, place_m: Place, other: State, near_m: Place, *, side_m: float) -> NaturalTwin:

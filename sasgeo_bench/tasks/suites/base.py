@@ -55,6 +55,10 @@ class NaturalTwin:
         yaw_deg = (seen.yaw_deg + self.turn_deg) % 360
         return replace(seen, easting_m=easting_m, northing_m=northing_m, yaw_deg=yaw_deg)
 
+    def reversed(self) -> "NaturalTwin":
+        """Return the same pair as its twin has it."""
+        return replace(self, place_m=self.twin_m, twin_m=self.place_m, turn_deg=-self.turn_deg)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suites of places that really look alike: natural-twins, with both in the disc, and natural-absent, with the other."""
 
+import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -147,8 +148,11 @@ def mine_twins(
     -----
     For each place each of the four neutral scorers of `mining` names the places that it takes for likest, at the same
     heading. The union is ordered by the mean of their distances, each over its median; then headings and shifts are
-    tried and the two drawings are laid on each other. A place is left out if a view moved by 25 to 48 m along its own
-    ground is as much like it as a twin must be: along a straight road no view has a place of its own.
+    tried and the two drawings are laid on each other. A pair is left out if a view of either place, moved by 25 to 48 m
+    along its own ground, is as much like it as a twin must be: along a straight road no view has a place of its own.
+
+    A coin says which of the two is the place: else every place would lie on the lattice and no twin would, and that
+    alone would tell them apart.
     """
     windows = describe(state, side_m=side_m, clear_m=clear_m + _REACH_M)
     places = _Places(state=state, windows=windows, side_m=side_m, clear_m=clear_m)
@@ -204,6 +208,7 @@ class _Places:
     def _aligned(self, pairs: Sequence[tuple[int, int]]) -> Iterator[NaturalTwin]:
         own: dict[int, float] = {}
         done: set[int] = set()
+        places: set[Place] = set()
         for at, there in pairs:
             place_m = _place(self.windows.points_m[at])
             if at not in own:
@@ -211,9 +216,13 @@ class _Places:
             if at in done or own[at] > LEAST_LIKENESS:
                 continue
             twin = align(self.state, place_m, self.state, _place(self.windows.points_m[there]), side_m=self.side_m)
-            if twin.likeness >= LEAST_LIKENESS:
-                done.add(at)
-                yield twin
+            if twin.likeness < LEAST_LIKENESS or own_likeness(self.state, twin.twin_m, self.side_m) > LEAST_LIKENESS:
+                continue
+            done.add(at)
+            tossed = _tossed(twin)
+            if tossed.place_m not in places:
+                places.add(tossed.place_m)
+                yield tossed
 
 
 def in_order(rows: Sequence[tuple[int, int]], distances: Sequence[Floats]) -> list[tuple[int, int]]:
@@ -245,6 +254,12 @@ def _first_of_each(unlike: Floats) -> NDArray[np.int64]:
 
 def _place(point: Points) -> Place:
     return (float(point[0]), float(point[1]))
+
+
+def _tossed(twin: NaturalTwin) -> NaturalTwin:
+    """Return a pair, or the same pair seen from its twin, by a coin that its coordinates toss."""
+    coin = hashlib.sha256(f"coin/{twin.place_m}/{twin.twin_m}".encode()).digest()[0] % 2
+    return twin.reversed() if coin else twin
 
 
 def own_likeness(state: State, place_m: Place, side_m: float) -> float:

@@ -19,7 +19,8 @@ from sasgeo_bench.tasks.query import CEILING, PriorGroup
 from sasgeo_bench.tasks.sampling import Drawer
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.base import changed_share
+from sasgeo_bench.tasks.suites.base import NaturalTwin, changed_share
+from sasgeo_bench.tasks.suites.mining import STRIDE_M, describe
 from sasgeo_bench.tasks.suites.natural import (
     LEAST_LIKENESS,
     NATURAL_TWINS,
@@ -138,9 +139,32 @@ def test_pairs_look_alike_do_not_overlap_and_beat_what_lies_beside_them(alike):
     for twin in scene.natural[:12]:
         apart_m = math.dist(twin.place_m, twin.twin_m)
         assert 2 * scene.view_reach_m <= apart_m <= NATURAL_TWINS.within_m(None)
-        assert twin.likeness >= LEAST_LIKENESS >= own_likeness(scene.map, twin.place_m, SIDE_M)
+        assert twin.likeness >= LEAST_LIKENESS
         for place_m in (twin.place_m, twin.twin_m):
+            assert own_likeness(scene.map, place_m, SIDE_M) <= LEAST_LIKENESS
             assert scene.map.is_mapped(np.array(place_m), scene.view_reach_m)
+
+
+def test_the_lattice_on_which_places_are_compared_does_not_tell_a_place_from_its_twin(alike):
+    scene = alike(TOWN)
+    west, _, _, north = scene.map.grid.bounds_m
+
+    def phases(places_m):
+        return (np.array(places_m) - (west, north)) % STRIDE_M
+
+    places, twins = (phases([getattr(twin, name) for twin in scene.natural]) for name in ("place_m", "twin_m"))
+    (node,) = {tuple(one) for one in phases(describe(scene.map, side_m=SIDE_M, clear_m=100.0).points_m)}
+    on_lattice = (places == node).all(axis=1), (twins == node).all(axis=1)
+    assert (on_lattice[0] | on_lattice[1]).all()  # one of the two is
+    assert 0.3 < on_lattice[0].mean() < 0.7
+    assert 0.3 < on_lattice[1].mean() < 0.7
+
+
+def test_a_pair_seen_from_its_twin_leads_back():
+    pair = NaturalTwin(place_m=(10.0, 20.0), twin_m=(300.0, 40.0), turn_deg=12.0, likeness=0.9, rank=3)
+    seen = Pose(easting_m=10.0, northing_m=20.0, yaw_deg=355.0, scale=1.02)
+    assert pair.reversed().pose(pair.pose(seen)) == seen
+    assert pair.reversed().reversed() == pair
 
 
 def test_pairs_are_more_alike_than_pairs_taken_at_random(alike):

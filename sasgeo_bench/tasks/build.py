@@ -234,7 +234,8 @@ def read_scene(request: Request, suite: Suite) -> tuple[Scene, Region]:
         profile=request.choice.profile,
     )
     if "natural twins" in needs:
-        scene = replace(scene, natural=suite.mine(scene, request.group))
+        seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name))
+        scene = replace(scene, natural=suite.mine(scene, request.group, seeds))
     return scene, base
 
 

@@ -348,7 +348,7 @@ class Suite(ABC):
         """Return the largest distance of a site from its anchor, east and north."""
         return ANCHOR_SPREAD * self.main_side_m
 
-    def mine(self, scene: Scene, group: PriorGroup | None) -> tuple[NaturalTwin, ...]:  # noqa: ARG002
+    def mine(self, scene: Scene, group: PriorGroup | None, seeds: "Seeds") -> tuple[NaturalTwin, ...]:  # noqa: ARG002
         """Return the pairs of places of the map that look alike, for a suite that needs "natural twins"."""
         return ()
 

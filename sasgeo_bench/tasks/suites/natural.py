@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suites of places that really look alike: natural-twins, with both in the disc, and natural-absent, with the other."""
 
-import hashlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -150,9 +149,6 @@ def mine_twins(
     heading. The union is ordered by the mean of their distances, each over its median; then headings and shifts are
     tried and the two drawings are laid on each other. A pair is left out if a view of either place, moved by 25 to 48 m
     along its own ground, is as much like it as a twin must be: along a straight road no view has a place of its own.
-
-    A coin says which of the two is the place: else every place would lie on the lattice and no twin would, and that
-    alone would tell them apart.
     """
     windows = describe(state, side_m=side_m, clear_m=clear_m + _REACH_M)
     places = _Places(state=state, windows=windows, side_m=side_m, clear_m=clear_m)
@@ -208,7 +204,6 @@ class _Places:
     def _aligned(self, pairs: Sequence[tuple[int, int]]) -> Iterator[NaturalTwin]:
         own: dict[int, float] = {}
         done: set[int] = set()
-        places: set[Place] = set()
         for at, there in pairs:
             place_m = _place(self.windows.points_m[at])
             if at not in own:
@@ -219,10 +214,7 @@ class _Places:
             if twin.likeness < LEAST_LIKENESS or own_likeness(self.state, twin.twin_m, self.side_m) > LEAST_LIKENESS:
                 continue
             done.add(at)
-            tossed = _tossed(twin)
-            if tossed.place_m not in places:
-                places.add(tossed.place_m)
-                yield tossed
+            yield twin
 
 
 def in_order(rows: Sequence[tuple[int, int]], distances: Sequence[Floats]) -> list[tuple[int, int]]:
@@ -254,12 +246,6 @@ def _first_of_each(unlike: Floats) -> NDArray[np.int64]:
 
 def _place(point: Points) -> Place:
     return (float(point[0]), float(point[1]))
-
-
-def _tossed(twin: NaturalTwin) -> NaturalTwin:
-    """Return a pair, or the same pair seen from its twin, by a coin that its coordinates toss."""
-    coin = hashlib.sha256(f"coin/{twin.place_m}/{twin.twin_m}".encode()).digest()[0] % 2
-    return twin.reversed() if coin else twin
 
 
 def own_likeness(state: State, place_m: Place, side_m: float) -> float:
@@ -320,15 +306,20 @@ class NaturalSuite(Suite):
         radius_m = (group or self.card.group).radius_m
         return FURTHEST_M if radius_m is None else min(FURTHEST_M, 1.6 * radius_m)
 
-    def mine(self, scene: Scene, group: PriorGroup | None) -> tuple[NaturalTwin, ...]:
-        """Find the twins of a scene's map."""
-        return mine_twins(
+    def mine(self, scene: Scene, group: PriorGroup | None, seeds: Seeds) -> tuple[NaturalTwin, ...]:
+        """Find the twins of a scene's map; the seed tosses which of two places is asked.
+
+        Else every place would lie on the lattice and no twin would, which alone would tell them apart.
+        """
+        found = mine_twins(
             scene.map,
             side_m=self.main_side_m,
             clear_m=self.clear_m(scene),
             within_m=self.within_m(group),
             min_density=self.card.min_density,
         )
+        tossed = (twin.reversed() if seeds.rng("coin", *twin.place_m).random() < 0.5 else twin for twin in found)
+        return tuple({twin.place_m: twin for twin in tossed}.values())
 
     def refusal(self, group: PriorGroup) -> str | None:
         """Refuse a disc that leaves no room for two places whose views do not overlap."""

@@ -184,7 +184,7 @@ def alike(scene) -> Callable[[str], Scene]:
     @cache
     def of_town(where: str) -> Scene:
         of = scene(where, NATURAL_TWINS.card.name)
-        return replace(of, natural=NATURAL_TWINS.mine(of, None))
+        return replace(of, natural=NATURAL_TWINS.mine(of, None, Seeds(root=1, names=(of.map.region,))))
 
     return of_town
 

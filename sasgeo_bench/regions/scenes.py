@@ -13,6 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.features import SEA
 from sasgeo_bench.osm.mapped import lonlat_box, project
 from sasgeo_bench.osm.read import read_extract
@@ -122,7 +123,7 @@ def share_ground(
         np.arange(low + _PROBE_M / 2, high, _PROBE_M) for low, high in ((west, east), (south, north))
     )
     probes = shapely.points(*(side.ravel() for side in np.meshgrid(easting_m, northing_m)))
-    tree = shapely.STRtree(probes[shapely.intersects(probes, coverage)])
+    probes = probes[shapely.intersects(probes, coverage)]
     shown = features[features["is_visible"].to_numpy(bool)]
     names, shapes = shown["class"].to_numpy(str), shown.geometry.to_numpy()
     is_line = shapely.get_dimensions(shapes) < 2
@@ -130,8 +131,8 @@ def share_ground(
     shapes[is_line] = shapely.buffer(shapes[is_line], shown["width_m"].to_numpy(float)[is_line] / 2, quad_segs=2)
 
     def share(areas: NDArray[np.object_]) -> float:
-        _, hit = tree.query(areas, predicate="intersects")
-        return len(np.unique(hit)) / max(len(tree), 1)
+        _, hit = overlapping(areas, probes, predicate="intersects")
+        return len(np.unique(hit)) / max(len(probes), 1)
 
     more = {kind: (land or {}).get(kind, shapes[:0]) for kind in _TAGS}
     return Ground(

@@ -14,10 +14,9 @@ from sasgeo_bench.core.errors import ConfigError, SasgeoError
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.progress import reporting, silent
 from sasgeo_bench.core.texts import message_of
-from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.running.testing import Check, check_of, tried
 from sasgeo_bench.tasks.build import check_task, make_tasks, plan_draw
-from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.query import CEILING, Query, Truth
 from sasgeo_bench.tasks.sampling import Drawer
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import QueryDraft, Site, Suite, Variant, ViewRequest
@@ -157,10 +156,9 @@ class _Kit:
                 return f"{variant.name} has no control with a view of its size"
             for site in self.sites:
                 one, two = self._draft(site, variant, _AsControl), self._draft(site, control)
-                is_hidden, is_less = one.evidence.cells == UNKNOWN, two.evidence.cells == UNKNOWN
-                if (is_hidden & ~is_less).any() and not (is_less & ~is_hidden).any():
-                    continue  # it sees less, and has errors of its own
-                if (one.evidence.cells != two.evidence.cells).any():
+                if CEILING in one.measured and one.evidence.unknown_share > two.evidence.unknown_share:
+                    continue  # what could be told by is hidden, as its ceiling says
+                if (one.evidence.cells != two.evidence.cells).any() and one.evidence.unknown_share != 1:
                     return f"{variant.name} shows something else than the control, so that a method may gain on it"
         return None
 

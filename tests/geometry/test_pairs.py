@@ -21,7 +21,7 @@ CODE = Path(sasgeo_bench.__file__).parent
 APART = {
     "geometry/pairs.py": 1,
     **dict.fromkeys(("osm/read.py", "osm/mapped.py", "osm/synthetic/sketch.py", "regions/build.py"), 1),
-    **dict.fromkeys(("ageing/compare.py", "sasgeo/nodes.py"), 1),
+    **dict.fromkeys(("ageing/compare.py", "sasgeo/nodes.py", "tasks/duplicates.py"), 1),
     **{f"tasks/suites/{name}.py": 1 for name in ("twins", "vectors", "ages", "mining")},
 }
 

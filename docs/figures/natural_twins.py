@@ -79,7 +79,7 @@ python docs/figures/natural_twins.py --out out
 ```
 
 with `run` for each of the matchers named below. Queries were drawn at train places alone, on the first region of each
-that has ten pairs or more: {sites} sites of
+that has eight pairs or more: {sites} sites of
 
 {names}.
 

@@ -322,7 +322,9 @@ class NaturalSuite(Suite):
         return tuple({twin.place_m: twin for twin in tossed}.values())
 
     def refusal(self, group: PriorGroup) -> str | None:
-        """Refuse a disc that leaves no room for two places whose views do not overlap."""
+        """Refuse a disc that leaves no room for two places whose views do not overlap, or that can omit neither."""
+        if group.radius_m is None:
+            return f"needs a disc that omits one of two places, and {group.name} has none: use r500"
         if self.within_m(group) > 2 * self.main_side_m * math.sqrt(2):
             return super().refusal(group)
         return f"needs a disc that holds two places whose views do not overlap, and {group.name} has none: use r500"

@@ -254,7 +254,7 @@ def test_a_region_without_look_alikes_and_a_disc_too_small_for_two_are_refused(s
     assert NATURAL_TWINS.lack(alike(TOWN)) is None
     small = PriorGroup(radius_m=100.0, yaw="weak", scale_sigma=0.03)
     assert "needs a disc that holds two places" in NATURAL_TWINS.refusal(small)
-    assert NATURAL_TWINS.refusal(replace(small, radius_m=None)) is None
+    assert "needs a disc that omits one" in NATURAL_TWINS.refusal(replace(small, radius_m=None))
     assert NATURAL_TWINS.within_m(replace(small, radius_m=2000.0)) == 2000.0
 
 

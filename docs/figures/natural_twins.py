@@ -112,6 +112,9 @@ By margin, where the disc holds both:
 {rule}
 {steps}
 
+A plain search lists both the place and its twin in {both} of {n} of these views (the others are `unrivalled`, and no
+contrast counts them): a view of 96 m with twice the usual error is often missed without its twin's doing.
+
 Where the place is not in the disc every answer is false; the share of them within 25 m of the twin:
 
 | part | n | {matchers} |
@@ -416,6 +419,8 @@ def main() -> None:
         away=_of_kind(away, "elsewhere")["margin"].median(),
         near=_of_kind(away, "twin alone")["margin"].median(),
         steps=by_margin(rows),
+        both=rows.loc[rows["kind"] == "N1", "query_id"].nunique(),
+        n=_of_kind(rows, "N1")["query_id"].nunique(),
         sites=len(rows[["region", "spot"]].drop_duplicates()),
         names=fill(", ".join(sorted(rows["region"].unique())), 120),
         shown=len(shown),

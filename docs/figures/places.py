@@ -45,8 +45,9 @@ Every real place that ships, by part of the split [`{SPLIT}`](../splits/README.m
 *Built*: mapped ground in steps of {STEP_M:.0f} m with a building. *Drawn*: mapped ground under any class. *Views*: of
 192 m, drawn by the suite `clean`, none of which overlaps another of its region; a place counts with two. A few regions
 of one city share up to 1 km2, Runavik and Toftir 2 km2: they are one place, so that no draw of places counts that
-ground as two. *Sealed* places are asked by a seed that is given at run time. `python docs/figures/places.py --out out`
-writes this page and the sheet anew, of what `build-region --every` built.
+ground as two. *Sealed* places are asked by a seed that is given at run time. *Maps*: the dates of all regions of a
+place. `python docs/figures/places.py --out out` writes this page and the sheet anew, of what `build-region --every`
+built.
 
 ![A small map of every region, by place](figures/places.webp)
 

@@ -131,7 +131,8 @@ def pool_rates(book: RateBook, *, exclude: Collection[str] = ()) -> PooledRates:
     """Pool the rates of the world's change over all countries but those excluded.
 
     A place must not be aged by what was measured in it, nor by its neighbours: exclude its country, which
-    `RateBook.country_of` gives for a measured extract. A country that was not measured may be named, too.
+    `RateBook.country_of` gives for a measured extract. A country that was not measured may be named, too; "Isle of Man"
+    is "isle-of-man".
 
     Notes
     -----
@@ -142,7 +143,8 @@ def pool_rates(book: RateBook, *, exclude: Collection[str] = ()) -> PooledRates:
     the pooled rate the median of the countries: they differ by far more than the interval of any one of them, so each
     is one sample, and one import must not set the rate of all.
     """
-    places = [place for place in book.places if place.country not in exclude]
+    excluded = {name.lower().replace(" ", "-") for name in exclude}
+    places = [place for place in book.places if place.country not in excluded]
     names = dict.fromkeys(name for place in places for name in place.classes)
     pooled = {name: _pooled(name, places) for name in names}
     return PooledRates(

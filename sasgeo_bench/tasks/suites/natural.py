@@ -362,13 +362,16 @@ class NaturalSuite(Suite):
         if variant.role == "falsifier":
             # two places, one answer
             return replace(draft, measured=draft.measured | {CEILING: 0.5, "unknown_added": seen.unknown_share})
-        margin = 1.0 - twin.likeness
+        margin = 1.0 - self.shown(shot, twin).likeness
         return replace(
             draft,
             strength=round(max(1, math.ceil(margin / STEP - 1e-6)) * STEP, 2),
-            measured={"margin": round(margin, 4), "twin_rank": float(twin.rank), TWIN_TURN: twin.turn_deg}
-            | draft.measured,
+            measured={"margin": round(margin, 4), "twin_rank": float(twin.rank), TWIN_TURN: twin.turn_deg},
         )
+
+    def shown(self, shot: ViewRequest, twin: NaturalTwin) -> NaturalTwin:  # noqa: ARG002
+        """Return the pair that a stress is about: that of the site."""
+        return twin
 
     def stress(self, shot: ViewRequest, twin: NaturalTwin, draft: QueryDraft) -> QueryDraft:  # noqa: ARG002
         """Return the draft with what the suite is about."""
@@ -395,7 +398,10 @@ class NaturalTwins(NaturalSuite):
 
 
 class NaturalAbsent(NaturalSuite):
-    """The disc holds the look-alike alone, of the same map or for a view of another country."""
+    """The disc holds the look-alike alone; or it holds the place, and the view is of the likest one of another country.
+
+    The likest place elsewhere may be far less alike than the twin: its own margin is the strength.
+    """
 
     def lack(self, scene: Scene) -> str | None:
         """Refuse a scene without another region, too."""
@@ -417,8 +423,11 @@ class NaturalAbsent(NaturalSuite):
         assert scene.elsewhere is not None  # noqa: S101 - by `lack`
         pose = other.pose(shot.site.pose)
         seen = shot.perceived(shot.variant.view(scene.elsewhere, pose), error_factor=self.errors)
-        measured = {"margin": round(1.0 - other.likeness, 4)}
-        return replace(draft, evidence=seen, is_present=False, has_pose=False, measured=measured)
+        return replace(draft, evidence=seen, is_present=False, has_pose=False)
+
+    def shown(self, shot: ViewRequest, twin: NaturalTwin) -> NaturalTwin:
+        """Return the pair with the place elsewhere for a view of that."""
+        return shot.scene.look_alikes[shot.site.index] if shot.variant.kind == ELSEWHERE else twin
 
 
 def look_alikes(

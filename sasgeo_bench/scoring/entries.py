@@ -569,6 +569,11 @@ def scored_rows(loaded: ScoredEntries, split: Split | None) -> dict[str, pd.Data
     """
     unused = {"train"} if split is not None and split.spec.kind == "holdout" else set()
     tasks = [task for task in loaded.tasks if not task.parts() <= unused]
+    if split is not None and loaded.tasks and not tasks:
+        raise ConfigError(
+            f"there is nothing to rank: all tasks are of train places of split {split.spec.id!r}, which no board "
+            "counts: draw some of calibration and test places"
+        )
     found = {}
     for item in loaded.answers:
         asked = {task.manifest.suite for task in tasks if task.folder in item.asked}

@@ -9,6 +9,7 @@ import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -42,7 +43,7 @@ from sasgeo_bench.scoring.rejection import JUDGED, why_not
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.split import SplitFile, find_split_file, make_split, read_split_file
+from sasgeo_bench.tasks.split import SplitFile, find_split, find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.plain_boards import plain_boards
 from tests.slow import rest_slow
@@ -596,6 +597,13 @@ def test_who_was_asked_nothing_of_a_task_is_not_on_the_board_of_its_suite(out):
     assert f"partly: {present.sum()} of {count} queries answered, {count - present.sum()} withheld" in lines
     with pytest.raises(ConfigError, match=r"nothing to rank: .* no suite has a matcher that was asked all"):
         told_by(out, out / "runs" / "partly", tasks=[out / "tasks" / "clean" / town for town in TOWNS])
+
+
+def test_tasks_of_train_places_alone_are_refused_as_what_they_are():
+    trained = SimpleNamespace(parts=lambda: {"train"})
+    loaded = entries.ScoredEntries(answers=(), tasks=(trained,), scores={}, views={})
+    with pytest.raises(ConfigError, match="nothing to rank: all tasks are of train places of split 'holdout'"):
+        entries.scored_rows(loaded, find_split("holdout"))
 
 
 def test_a_region_that_is_left_out_is_as_if_it_had_never_been_asked(out):

@@ -72,8 +72,8 @@ overlap; {without} of the {all} open places have none. Made by
 ```text
 sasgeo-bench build-region --every --out out
 python docs/figures/natural_twins.py --out out --mine
-sasgeo-bench make-queries --suite natural-twins --suite natural-absent --split world --seed 0 --n 3 --up-to --skip \\
-  --regions duitama --out out      # and the others
+sasgeo-bench make-queries --suite natural-twins --split world --seed 0 --n 3 --up-to --skip \\
+  --regions duitama --out out      # and the others; natural-absent with --n 2
 sasgeo-bench run --matcher sasgeo --tasks out/tasks/natural-twins/* --tasks out/tasks/natural-absent/* --out out
 python docs/figures/natural_twins.py --out out
 ```

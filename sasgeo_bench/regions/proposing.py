@@ -97,8 +97,8 @@ class ExtractManifest(Document):
 def read_places(path: Path) -> dict[str, list[ListedExtract]]:
     """Read the extracts of each place of a manifest, by date.
 
-    Raise `ConfigError`, which names the block, if the file is no manifest, two extracts of a place are of one day or of
-    two countries, or a place has the name of another one's second region.
+    Raise `ConfigError`, which names the block, if the file is no manifest, two extracts of a place are of one day, in
+    one file or of two countries, or a place has the name of another one's second region.
     """
     try:
         text = plain_file(path).read_text(encoding="utf-8")
@@ -116,6 +116,12 @@ def read_places(path: Path) -> dict[str, list[ListedExtract]]:
         dates, countries = [item.date for item in items], {item.country for item in items}
         if len(set(dates)) < len(dates):
             raise ConfigError(f"{place}: two extracts are of one day: keep one of them")
+        files = [item.file for item in items if ".osh" not in item.file]
+        twice = next((file for file in files if files.count(file) > 1), None)
+        if twice is not None:
+            raise ConfigError(
+                f"{place}: {twice} is of two days: name one, for only a full history (*.osh.pbf) has several"
+            )
         if len(countries) > 1:
             raise ConfigError(f"{place} lies in {' and in '.join(sorted(countries))}: give each its own name")
         other = next((name for name in names_of(place)[1:] if name in found), None)

@@ -202,6 +202,7 @@ def test_a_place_of_a_known_region_is_left_out(towns, manifest):
             r"extract 2 \(mill-2020-01-01.osm.pbf\): 'date' is a day, YYYY-MM-DD, got '2020-02-30'",
         ),
         ([row(MILL, "mill"), row(MILL, "mill", country="Elsewhere")], "two extracts are of one day"),
+        ([row(MILL, "mill"), row(MILL, "mill", date="2019-01-01")], "is of two days: name one"),
         ([row(FIRST, "garden"), row(SECOND, "garden", country="E")], "garden lies in E and in Nowhere"),
         (
             [row(MILL, "The Mill")],

@@ -13,7 +13,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sasgeo_bench.regions.evidence import UNKNOWN
-from sasgeo_bench.tasks.query import CEILING, TWIN_TURN, PriorGroup
+from sasgeo_bench.tasks.query import CEILING, TWIN_TURN, PriorGroup, Role
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import (
     Edit,
@@ -455,6 +455,19 @@ _WHAT: Final = (
     "each other as they agree best; of what is drawn at either place, the other shows 0.85 or more within 4 m."
 )
 
+
+def _variants(*stresses: str) -> tuple[Variant, ...]:
+    """Return a control, the stresses and a falsifier, all of one size of view."""
+    kinds: tuple[tuple[Role, str], ...] = (
+        ("control", "twin omitted"),
+        *(("stress", kind) for kind in stresses),
+        ("falsifier", "difference removed"),
+    )
+    return tuple(
+        Variant(role=role, kind=kind, strength=float(role == "stress"), view_cells=VIEW_CELLS) for role, kind in kinds
+    )
+
+
 NATURAL_TWINS: Final = NaturalTwins(
     card=SuiteCard(
         name="natural-twins",
@@ -468,12 +481,7 @@ NATURAL_TWINS: Final = NaturalTwins(
         group=TWIN_GROUP,
         min_density=0.1,
     ),
-    variants=(
-        Variant(role="control", kind="twin omitted", view_cells=VIEW_CELLS),
-        Variant(role="stress", kind="N1", strength=1.0, view_cells=VIEW_CELLS),
-        Variant(role="stress", kind=WITH_VECTORS, strength=1.0, view_cells=VIEW_CELLS),
-        Variant(role="falsifier", kind="difference removed", view_cells=VIEW_CELLS),
-    ),
+    variants=_variants("N1", WITH_VECTORS),
 )
 
 NATURAL_ABSENT: Final = NaturalAbsent(
@@ -490,10 +498,5 @@ NATURAL_ABSENT: Final = NaturalAbsent(
         group=TWIN_GROUP,
         min_density=0.1,
     ),
-    variants=(
-        Variant(role="control", kind="twin omitted", view_cells=VIEW_CELLS),
-        Variant(role="stress", kind="twin alone", strength=1.0, view_cells=VIEW_CELLS),
-        Variant(role="stress", kind=ELSEWHERE, strength=1.0, view_cells=VIEW_CELLS),
-        Variant(role="falsifier", kind="difference removed", view_cells=VIEW_CELLS),
-    ),
+    variants=_variants("twin alone", ELSEWHERE),
 )

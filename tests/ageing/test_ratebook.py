@@ -130,6 +130,7 @@ def test_a_country_left_out_has_no_influence_on_any_number():
         left = [item for item in packaged.places if item.country != country]
         rest = RateBook(version=VERSION, attribution="", licence="", place=left)
         assert pool_rates(packaged, exclude=[country]) == pool_rates(rest)
+        assert pool_rates(packaged, exclude=[country.replace("-", " ").title()]) == pool_rates(rest)  # as on a map
 
 
 def test_a_place_with_few_things_or_without_bound_has_no_say_in_what_they_tell():

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import scipy
 from numpy.typing import NDArray
+from places import split, write
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose
@@ -32,14 +33,13 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import read_scene
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, UNRIVALLED, Truth
 from sasgeo_bench.tasks.sheet import paint
-from sasgeo_bench.tasks.split import Place, Split, find_split_file, make_split, read_split_file
+from sasgeo_bench.tasks.split import Place
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import NaturalTwin, Seeds
 from sasgeo_bench.tasks.suites.natural import NATURAL_TWINS, STEP, VIEW_CELLS, WITH_VECTORS, pair_of
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.task_plan import Request
 
-SPLIT: Final = "world"
 MATCHERS: Final = ("sasgeo", "schmidt_segcorr", "raster_soft", "fft_vote")
 DOCS: Final = Path(__file__).parents[1]
 FIGURES: Final = DOCS / "figures"
@@ -143,14 +143,6 @@ matchers found the place.
 |---|---|---|---|---|---|
 {rows}
 """
-
-
-@cache
-def split() -> Split:
-    """Return the split, on the lattices of its regions."""
-    spec = read_split_file(find_split_file(SPLIT))
-    files = list_region_files()
-    return make_split(spec, {name: read_region_file(files[name]).grid() for name in spec.region_ids})
 
 
 def mined(region: str, out: Path) -> list[NaturalTwin]:
@@ -264,11 +256,6 @@ def sheet_of(pairs: Sequence[Pair], names: Sequence[str], out: Path, *, side: in
         write(sheet, name, (left, top + side + TEXT_PX - 4))
     write(sheet, ATTRIBUTION, (2, sheet.shape[0] - 4))
     return sheet
-
-
-def write(sheet: NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
-    """Write a line of text."""
-    cv2.putText(sheet, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.36, (40, 40, 40), 1, cv2.LINE_AA)
 
 
 def likest(pairs: Sequence[Pair], *, count: int, most: int) -> list[Pair]:

@@ -1,32 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ctrl-C and the signals of a system that stops, also while libraries are imported; this file imports none of ours."""
 
+import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Timer
 from types import FrameType
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
 
 EXIT_INTERRUPTED: Final = 128 + signal.SIGINT
 _OTHERS: Final = (signal.SIGTERM, signal.SIGHUP)  # which else end a program without a word, and leave what it began
+_PAUSE_S: Final = 0.01  # after which an interrupt that Python dropped comes again
 _received: list[int] = []  # of these, in this process: a KeyboardInterrupt does not state which it was
 
 
 @contextmanager
 def interrupted_by_signals() -> Iterator[None]:
-    """Let the signals of a system that stops end the program as Ctrl-C does; one that is ignored (`nohup`) stays so."""
+    """Let the signals of a system that stops end the program as Ctrl-C does; one that is ignored (`nohup`) stays so.
+
+    An interrupt that comes in a destructor or in a callback of a weak reference is dropped by Python: it is sent again.
+    """
 
     def stop(number: int, _: FrameType | None) -> None:
         """Do as Ctrl-C does, and remember who asked."""
         _received.append(number)
         raise KeyboardInterrupt
 
+    def send_again(dropped: "UnraisableHookArgs") -> None:
+        """Send an interrupt again that Python dropped, a little later; everything else is printed as before."""
+        if not isinstance(dropped.exc_value, KeyboardInterrupt):
+            print_dropped(dropped)
+            return
+        number = _received[-1] if _received else signal.SIGINT
+        Timer(_PAUSE_S, os.kill, (os.getpid(), number)).start()
+
+    print_dropped = sys.unraisablehook
+    sys.unraisablehook = send_again
     taken = [number for number in _OTHERS if signal.getsignal(number) is signal.SIG_DFL]
     for number in taken:
         signal.signal(number, stop)
     try:
         yield
     finally:
+        sys.unraisablehook = print_dropped
         _received.clear()
         for number in taken:
             signal.signal(number, signal.SIG_DFL)

@@ -238,12 +238,6 @@ for name in ("SIGTERM", "SIGHUP"):
     signal.signal(getattr(signal, name), signal.SIG_DFL)
 
 def strike(number, frame):
-    # Not where Python drops exceptions: in a callback of a weak reference, or in a destructor.
-    while frame is not None:
-        if frame.f_code.co_name in ("remove", "__del__"):
-            signal.setitimer(signal.ITIMER_PROF, 0.001)
-            return
-        frame = frame.f_back
     signal.raise_signal(NUMBER)
 
 signal.signal(signal.SIGPROF, strike)
@@ -264,6 +258,36 @@ def test_an_interrupt_leaves_nothing_half_written(tmp_path, number, status):
     left = [path for path in (tmp_path / "out/regions").iterdir() if not path.name.endswith(".lock")]
     assert all((path / "region.json").is_file() for path in left)
     assert not any(path.name.startswith(".") for path in left)
+
+
+# Interrupts itself in a callback of a weak reference, where Python drops what is raised; else it sleeps for a minute.
+DROPPED = """
+import signal, sys, time, weakref
+from sasgeo_bench.cli.interrupts import exit_interrupted, interrupted_by_signals
+
+class Held:
+    pass
+
+signal.signal(signal.SIGTERM, signal.SIG_DFL)
+with interrupted_by_signals():
+    held = Held()
+    watched = weakref.ref(held, lambda _: signal.raise_signal(NUMBER))
+    try:
+        del held
+        print("dropped", flush=True)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        sys.exit(exit_interrupted())
+"""
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_an_interrupt_that_python_drops_comes_again(tmp_path, number, status):
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    program = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)" + DROPPED
+    command = [sys.executable, "-c", program.replace("NUMBER", str(int(number)))]
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+    assert (ended.returncode, ended.stdout, ended.stderr) == (status, "dropped\n", "")
 
 
 def test_a_message_without_end_is_cut_in_its_middle(program):

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from sasgeo_bench.running.worker import Limits, Reach
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, write_labelled
 from sasgeo_bench.sensing.segmentation import SILENT, Segmentation
 from sasgeo_bench.sensing.tiny_images import tiny_images, with_picture
+
+_LEAST_CROPPED_PX: Final = 64  # a side of a picture whose crop still shows something
+_MOST_CROP_DIFFERENCE: Final = 0.1  # of mean probabilities: normalization by the picture moves them by 0.03 at most
 
 
 def check_segmenter(
@@ -81,6 +84,8 @@ class _SegmenterKit(Kit[SegmenterCard, Segmentation, AerialImage]):
         yield self.over("the same answer twice", sound, self.twice)
         yield self.over("the same classes everywhere", sound, lambda label, _: self._classes(label, self.first[label]))
         yield self.over("small and odd pictures", odd_images() if sound else {}, self._odd)
+        wide = {label: image for label, image in sound.items() if min(image.shape) >= _LEAST_CROPPED_PX}
+        yield self.over("a crop gives what the whole gives", wide, self._cropped)
         yield self.order(sound)
         yield self.cost()
 
@@ -115,3 +120,21 @@ class _SegmenterKit(Kit[SegmenterCard, Segmentation, AerialImage]):
         reply = self.ask(image)
         shown = f"{label} ({image.shape[0]} x {image.shape[1]})"
         return self.fault(shown, image, reply) or self._classes(label, reply)
+
+    def _cropped(self, label: str, image: AerialImage) -> str | None:
+        """Return a fault if the upper left of a picture, without the rest, has other probabilities there."""
+        rows, cols = (side * 3 // 4 for side in image.shape)
+        reply = self.ask(image.cropped(0, 0, rows, cols))
+        shown = f"a crop of {label} ({rows} x {cols})"
+        whole, crop = self.first[label].found, reply.found
+        if whole is None or crop is None:
+            return self.fault(shown, image, reply)
+        fault = self._classes(label, reply)
+        if fault is not None:
+            return fault
+        inner = np.s_[:, : rows * 2 // 3, : cols * 2 // 3]  # what lies near the new edges may differ
+        differs = np.abs(whole.probabilities()[inner] - crop.probabilities()[inner])
+        by_class = [float(np.mean(plane[np.isfinite(plane)])) for plane in differs if np.isfinite(plane).any()]
+        if not by_class or max(by_class) <= _MOST_CROP_DIFFERENCE:
+            return None
+        return f"{shown} has probabilities that differ by {max(by_class):.2f} on average from those of the whole"

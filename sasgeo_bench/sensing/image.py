@@ -7,10 +7,10 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Final, overload
+from typing import Any, Final, Self, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,6 +189,21 @@ class AerialImage:
     def shape(self) -> tuple[int, int]:
         """Return rows and columns."""
         return (self.rgb.shape[0], self.rgb.shape[1])
+
+    def cropped(self, top: int, left: int, rows: int, cols: int) -> Self:
+        """Return a part of the image by its first row and column and its size, as the same camera sees it.
+
+        >>> from sasgeo_bench.sensing.tiny_images import tiny_images
+        >>> whole = tiny_images()[0].image
+        >>> whole.cropped(10, 20, 30, 40).camera.intrinsics.centre_px, whole.camera.intrinsics.centre_px
+        ((44.0, 38.0), (64.0, 48.0))
+        """
+        rgb = np.ascontiguousarray(self.rgb[top : top + rows, left : left + cols])
+        across, down = self.camera.intrinsics.centre_px
+        lens = replace(
+            self.camera.intrinsics, width_px=rgb.shape[1], height_px=rgb.shape[0], centre_px=(across - left, down - top)
+        )
+        return replace(self, rgb=rgb, camera=replace(self.camera, intrinsics=lens))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -113,8 +113,17 @@ class LooksBack(Good):
         key = image.rgb.tobytes()
         if key != self.last:
             self.before, self.last = self.last, key
-        share = 0.2 if self.before is None else 0.4
+        share = 0.3 if self.before is None else 0.36
         return super().segment(image, learned=None).with_shares({"building": share})
+
+
+class SeesTheFrame(Good):
+    """Takes the upper half of every picture for roofs."""
+
+    def segment(self, image, *, learned):
+        rows, cols = image.shape
+        upper = np.repeat(np.arange(rows)[:, None] < rows / 2, cols, axis=1)
+        return Segmentation.of_probabilities(self.card.classes, np.stack([upper, ~upper]).astype(float))
 
 
 class OtherClasses(Good):

@@ -18,6 +18,7 @@ ROWS = (
     "the same answer twice",
     "the same classes everywhere",
     "small and odd pictures",
+    "a crop gives what the whole gives",
     "the same answers in any order",
     "time and memory",
     "kept to its scratch folder",
@@ -75,7 +76,8 @@ def test_what_a_segmenter_may_do_is_no_fault(table, name) -> None:
         ("Fickle", 2, "image 0 has another answer the second time"),
         ("OtherClasses", 3, ", the first one "),
         ("WantsRoom", 4, "one pixel (1 x 1): crash: ValueError: the picture is smaller than the filter"),
-        ("LooksBack", 5, "has another answer after others, in a fresh process"),
+        ("SeesTheFrame", 5, "a crop of image 0 (72 x 96) has probabilities that differ by 0.2"),
+        ("LooksBack", 6, "has another answer after others, in a fresh process"),
     ],
 )
 def test_a_fault_is_reported_in_its_own_row(table, name, row, words) -> None:

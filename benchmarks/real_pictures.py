@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Say how well a segmenter orders the pixels of real pictures: the area under the ROC curve, class by class.
+
+    .venv/bin/python benchmarks/real_pictures.py --out out pardubice-ortho chateaugiron-ortho
+
+The regions are built in `--out` and have imagery. Their pictures are cut into views of 256 m, north up, without gaps;
+labels are the layers of the map, roads as one class. Intervals (95 %) draw views; they say nothing of other places.
+`--weights FILE` asks other weights of `osm_unet`, `--box W,E,N,S` a part of the picture, as fractions of its sides.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from sasgeo_baselines.segmenters.osm_unet import OsmUNet
+
+import sasgeo_bench as sgb
+from sasgeo_bench.scoring.segmentation import PixelCounts, segmentation_scores
+from sasgeo_bench.sensing.reference_imagery import region_views
+
+ROADS: Final = ("road_major", "road_minor")
+ROAD: Final = "road"
+SHOWN: Final = ("building", ROAD, "path_track", "railway", "water", "green", "farmland", "parking", "bare")
+GSD_M: Final = 0.5
+SIDE_PX: Final = 512
+
+
+def joined_labels(view: sgb.LabelledImage) -> sgb.LabelledImage:
+    """Return a view whose roads are one class."""
+    at = [view.classes.index(name) for name in ROADS if name in view.classes]
+    if not at:
+        return view
+    rest = [number for number in range(len(view.classes)) if number not in at]
+    roads = view.labels[at]
+    one = np.where((roads == sgb.UNKNOWN).any(axis=0), sgb.UNKNOWN, roads.max(axis=0)).astype(np.uint8)
+    names = (*(view.classes[number] for number in rest), ROAD)
+    return replace(view, classes=names, labels=np.concatenate([view.labels[rest], one[None]]))
+
+
+def joined_answer(found: sgb.Segmentation) -> sgb.Segmentation:
+    """Return a segmentation with the probability of any road beside the other classes."""
+    chances = found.probabilities()
+    at = [found.classes.index(name) for name in ROADS if name in found.classes]
+    road = 1 - np.prod(1 - chances[at], axis=0, keepdims=True)
+    return sgb.Segmentation.of_probabilities((*found.classes, ROAD), np.concatenate([chances, road]))
+
+
+def counted(segmenter: sgb.Segmenter, region: sgb.Region, box: Sequence[float]) -> Iterator[PixelCounts]:
+    """Yield the counts of each view of a part of a region's picture."""
+    if region.imagery is None:
+        raise SystemExit(f"{region.manifest.id} has no imagery: name a region whose file has [[imagery]]")
+    west, south, east, north = region.imagery.record.bounds_m
+    bounds = (
+        *(west + box[0] * (east - west), north - box[3] * (north - south)),
+        *(west + box[1] * (east - west), north - box[2] * (north - south)),
+    )
+    views = region_views(region, bounds, place=region.manifest.id, gsd_m=GSD_M, side_px=SIDE_PX)
+    for number, view in enumerate(views):
+        found = joined_answer(segmenter.segment(view.image, learned=None))
+        yield PixelCounts.of(joined_labels(view), found, image=str(number))
+
+
+def main() -> None:
+    """Print a row for each region and class."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("regions", nargs="+")
+    parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument("--segmenter", default="osm_unet", help="name of one that needs no training")
+    parser.add_argument("--weights", type=Path, help="of osm_unet, instead of those that ship")
+    parser.add_argument("--box", default="0,1,0,1", help="west, east, north, south")
+    options = parser.parse_args()
+    segmenter = OsmUNet(options.weights) if options.weights else sgb.load_segmenter(options.segmenter)
+    box = [float(part) for part in options.box.split(",")]
+    print("| region | class | AUC | 95 % | share | views |\n|---|---|---:|---|---:|---:|")
+    for name in options.regions:
+        counts = list(counted(segmenter, sgb.read_region(options.out / "regions" / name), box))
+        scores = segmentation_scores(counts, draws=500, segmenter=segmenter.card.name)
+        rows = scores[(scores["group"] == "all") & (scores["metric"] == "auc")].set_index("class")
+        for shown in SHOWN:
+            if shown not in rows.index or not np.isfinite(rows.loc[shown, "value"]):
+                continue
+            row, pixels = rows.loc[shown], sum(one.of_class(shown) for one in counts)
+            share = pixels[1].sum() / pixels.sum()
+            limits = f"{row['lo_images']:.3f} to {row['hi_images']:.3f}"
+            print(f"| {name} | {shown} | {row['value']:.3f} | {limits} | {share:.3f} | {len(counts)} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -32,7 +32,7 @@ _WINDOW: Final = 4  # sides of a crop in one of a window
 _LEAST_SIDE_PX: Final = 16
 _MOST_SIDE_PX: Final = 2048
 _MOST_ZOOM: Final = 2.0
-_MOST_TRIES: Final = 200  # windows in turn that show too little mapped ground
+_MOST_TRIES: Final = 2000  # poses in turn that show too little mapped ground
 _AROUND: Final = 0.6  # share of windows around something that is mapped
 _LEAST_KNOWN: Final = 0.5  # of a crop
 _MARGIN_M: Final = 60.0  # around a window: what stands there has yards and shadows in it
@@ -220,7 +220,7 @@ def _crops(sources: Sequence[_Source], shape: _Shape, *, each: int) -> Iterator[
     opened = 0
     for number in itertools.count():
         for attempt in range(_MOST_TRIES):
-            is_new = len(windows) < _OPEN or attempt > 0
+            is_new = len(windows) < _OPEN or attempt % _OPEN == _OPEN - 1
             if is_new or poses.random() < 1 / each:
                 window = sources[opened % len(sources)].open(poses)
                 opened += 1
@@ -241,7 +241,7 @@ def _crops(sources: Sequence[_Source], shape: _Shape, *, each: int) -> Iterator[
                 break
         else:
             raise ImageryError(
-                f"{_MOST_TRIES} windows in turn show too little mapped ground for crops of {shape.side_px} pixels of "
+                f"{_MOST_TRIES} crops in turn show too little mapped ground, with {shape.side_px} pixels of "
                 f"{shape.pixel_m:g} m: take smaller ones, or another region"
             )
         looks = np.random.default_rng((shape.seed, 1, number))

@@ -53,7 +53,7 @@ class Sheet:
     """A window of a map: its layers, and what stands where.
 
     `ground`, uint16 of shape (rows, cols, 2), holds the number of the uppermost thing that is no building, and how far
-    the cell is inside the kerb of a street and `BEYOND_M`, in `INCHES` of a metre. `built`, of that shape, holds the
+    the cell is inside a street or railway, plus `BEYOND_M`, in `INCHES` of a metre. `built`, of that shape, holds the
     number of the building, and of the one whose yard the cell may be. `roadside` are places along the axes of streets,
     and `stalls` those of car parks, rows of (u, v, direction u, direction v, half width), cells.
     """
@@ -85,12 +85,12 @@ def make_sheet(
     number = burn_numbers(areas, window)
     houses = shapes["building"] if "building" in shapes else no_shapes()
     house = burn_numbers(houses.areas(), window)
-    is_street = np.isin(np.concatenate([["none"], look]), STREETS)[number]
+    is_way = np.isin(np.concatenate([["none"], look]), (*STREETS, "railway"))[number]
     parked = shapes["parking"] if "parking" in shapes else no_shapes()
     return Sheet(
         grid=window,
         bits=bits,
-        ground=np.stack([number, _kerb(is_street, window)], axis=-1).clip(0, _MOST_THINGS).astype(np.uint16),
+        ground=np.stack([number, _kerb(is_way, window)], axis=-1).clip(0, _MOST_THINGS).astype(np.uint16),
         built=np.stack([house, _yards(house, window)], axis=-1).clip(0, _MOST_THINGS).astype(np.uint16),
         things=_things(look, areas, np.concatenate([*(part.width_m for _, part in flat), np.zeros(0)]), window),
         buildings=_things(np.repeat("building", len(houses)), houses.geometry, houses.width_m, window),
@@ -114,10 +114,12 @@ def _things(look: NDArray[np.str_], geometry: NDArray[np.object_], width_m: Numb
     )
 
 
-def _kerb(is_street: Mask, grid: Grid) -> NDArray[np.int32]:
-    """Return how far each cell is inside a street, less where it is outside, from `BEYOND_M` outside on."""
-    kerb_m = inside_m(is_street, grid) - inside_m(~is_street, grid) if is_street.any() else np.float32(-BEYOND_M)
-    return np.broadcast_to(((kerb_m + BEYOND_M) * INCHES).astype(np.int32), grid.shape)
+def _kerb(is_way: Mask, grid: Grid) -> NDArray[np.int32]:
+    """Return how far each cell is inside a way, or outside of it, from `BEYOND_M` outside on."""
+    if not is_way.any():
+        return np.zeros(grid.shape, dtype=np.int32)
+    kerb_m = inside_m(is_way, grid) - inside_m(~is_way, grid)
+    return np.asarray((kerb_m + np.float32(BEYOND_M)) * INCHES, dtype=np.int32)
 
 
 def _yards(house: NDArray[np.int32], grid: Grid) -> NDArray[np.int32]:

@@ -8,7 +8,7 @@ randomization; Tobin et al., IROS 2017). The careful pictures that queries are m
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Final, TypeVar
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from sasgeo_bench.sensing.rendering.texture import Field
 
 Numbers = NDArray[np.int64]
 Rng = np.random.Generator
+Number = TypeVar("Number", np.int64, np.float32)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,9 +223,7 @@ class _Drawing:
         if self.has.shadows:
             tone *= self.shadow()
         colour *= tone[..., None]
-        if self.has.colour:
-            colour = self.develop(colour)
-        picture = np.clip(colour, 0, 255).astype(np.uint8)
+        picture = self.develop(colour) if self.has.colour else np.clip(colour, 0, 255).astype(np.uint8)
         return self.sense(picture) if self.has.sensor else picture
 
     # The table: what each row looks like.
@@ -381,18 +380,15 @@ class _Drawing:
         if self.has.off_m:
             cells = self.has.off_m / sheet.grid.cell_size_m
             off = cells * rng.uniform(0, 0.7) * _direction(rng)
-            bend = 0.1 * cells * rng.standard_normal((2, 5, 5)).astype(np.float32)
-            size = (self.side, self.side)
-            u, v = (
-                part + np.float32(shift) + cv2.resize(wave, size)
-                for part, shift, wave in zip((u, v), off, bend, strict=True)
-            )
+            bend = (off + 0.1 * cells * rng.standard_normal((5, 5, 2))).astype(np.float32)
+            wave = cv2.resize(bend, (self.side, self.side))
+            u, v = u + wave[..., 0], v + wave[..., 1]
             own = (0.25 * cells * rng.uniform(0, 1) * _direction(rng)).astype(np.float32)
             house_u, house_v = u + own[0], v + own[1]
         self.u, self.v = house_u, house_v
         half = np.float32(0.5)  # OpenCV counts from the middle of a cell
-        ground = cv2.remap(sheet.ground, u - half, v - half, cv2.INTER_NEAREST)
-        built = cv2.remap(sheet.built, house_u - half, house_v - half, cv2.INTER_NEAREST)
+        ground = np.asarray(cv2.remap(sheet.ground, u - half, v - half, cv2.INTER_NEAREST), dtype=np.uint16)
+        built = np.asarray(cv2.remap(sheet.built, house_u - half, house_v - half, cv2.INTER_NEAREST), dtype=np.uint16)
         self.kerb_m = ground[..., 1].astype(np.float32) / np.float32(INCHES) - np.float32(BEYOND_M)
         shown = self.rows_of(len(sheet.things), self.things_at, self.has.missing).take(ground[..., 0])
         self.house = self.rows_of(len(sheet.buildings), 0, self.has.missing).take(built[..., 0])
@@ -540,14 +536,19 @@ class _Drawing:
         self.extra_m = np.where(here, raised, 0)
 
     def stamp_trees(self) -> None:
-        """Put single trees into yards, parks and open ground, and along streets, some over the road."""
+        """Put groves and single trees into yards, parks and open ground, and along streets, some over the road."""
         rng, layer, metre = self.rng, self.shows_as_int(), 1 / self.px
-        count = rng.poisson(np.exp(rng.uniform(np.log(3.0), np.log(120.0))) * (self.side * self.px / 128) ** 2)
-        at = rng.uniform(0, self.side, size=(count, 2))
-        cells = layer[at[:, 1].astype(int), at[:, 0].astype(int)]
         grows = np.zeros(len(self.table.colour), dtype=bool)
         grows[:_PLOTS] = grows[self.yards_at :] = True
         grows[self.parks] = True
+        if rng.random() < 0.7:
+            dense = self.tile(self.tiles.mottle, int(rng.integers(2))) > rng.uniform(0.6, 2.2)
+            if rng.random() < 0.5:  # within parks, yards and plots; else across whatever is not built
+                dense &= grows.take(layer)
+            layer[dense & (self.top == 0)] = _PLOTS + _CROWN + int(rng.integers(_LIT - _CROWN))
+        count = rng.poisson(np.exp(rng.uniform(np.log(3.0), np.log(120.0))) * (self.side * self.px / 128) ** 2)
+        at = rng.uniform(0, self.side, size=(count, 2))
+        cells = layer[at[:, 1].astype(int), at[:, 0].astype(int)]
         at = at[grows[cells]]
         along_street, ahead, half = self.seen(self.sheet.roadside, rng.uniform(0, 0.8) ** 3)
         side = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) * rng.choice([-1.0, 1.0], size=(len(half), 1))
@@ -628,7 +629,7 @@ class _Drawing:
         colour.reshape(-1, 3)[yard] = self.table.colour.take(self.yards_at + house[is_court], axis=0)
 
     def mark_streets(self, colour: Field, tone: Field) -> None:
-        """Draw kerbs and, on wide streets, lanes."""
+        """Draw kerbs, lanes on wide streets, and rails."""
         rng, things = self.rng, self.sheet.things
         last = self.things_at + len(things)
         at = np.flatnonzero((self.kerb_m > 0) & (self.shows >= self.things_at) & (self.shows < last))
@@ -645,7 +646,10 @@ class _Drawing:
         on_line = np.abs(kerb_m - wide_m / 2) < line_m / 2
         on_line |= (np.abs(kerb_m - wide_m / 4) < line_m / 2) & (wide_m > 10)
         dash = np.sin((self.u.ravel()[at] + 1.3 * self.v.ravel()[at]) * 0.5) > rng.choice([-2.0, -0.3, 0.2])
-        marks = at[has_lanes & on_line & dash]
+        is_rail = (things.look == "railway").take(row)
+        on_rail = is_rail & (np.abs(np.abs(kerb_m - wide_m / 2) - 0.75) < max(0.2, self.px / 2))
+        tone.ravel()[at[on_rail]] *= np.float32(rng.uniform(0.6, 1.5))
+        marks = at[has_lanes & on_line & dash & ~is_rail]
         white = np.float32(rng.uniform(0.3, 0.95))
         pixels = colour.reshape(-1, 3)
         pixels[marks] += white * (np.float32(rng.uniform(190, 240)) - pixels[marks])
@@ -672,12 +676,11 @@ class _Drawing:
         for power in range(6):
             right, down = np.rint(-self.sun * 2**power).astype(int)
             shade = np.maximum(shade, _moved(shade, int(right), int(down)) - drop * np.float32(2**power))
-        dark = (shade > high + np.float32(0.4)).astype(np.float32)
-        dark = cv2.blur(dark, (3, 3))
+        dark = np.asarray(cv2.blur((shade > high + np.float32(0.4)).astype(np.float32), (3, 3)))
         deep = rng.uniform(0.2, 0.75) if rng.random() < 0.85 else rng.uniform(0, 0.1)
         return np.asarray(1 - np.float32(deep) * dark)
 
-    def develop(self, colour: Field) -> Field:
+    def develop(self, colour: Field) -> Picture:
         """Mix channels, and change light, haze and contrast."""
         rng = self.rng
         mix = np.eye(3) + rng.choice([0.03, 0.12, 0.3], p=(0.5, 0.35, 0.15)) * rng.standard_normal((3, 3))
@@ -688,40 +691,39 @@ class _Drawing:
         haze = rng.beta(1, 5) * 0.7
         veil = rng.uniform(120, 235) * np.exp(0.08 * rng.standard_normal(3))
         change = np.column_stack([mix * (gain * (1 - haze))[:, None], haze * veil])
-        developed = cv2.transform(colour, change.astype(np.float32))
+        developed = np.asarray(cv2.transform(colour, change.astype(np.float32)), dtype=np.float32)
         if rng.random() < 0.3:
             light = 1 + np.float32(rng.uniform(0, 0.35)) * self.tile(self.tiles.mottle, len(self.tiles.mottle) - 1)
             developed *= light[..., None]
         level = float(developed[::8, ::8].mean())
         if rng.random() < 0.85:  # most are exposed so that they are neither dark nor bright
             developed *= np.float32(np.clip(level, 70, 165) / max(level, 1))
-        white, gamma = np.float32(255), np.float32(np.exp(rng.uniform(-0.35, 0.35)))
-        return np.asarray(white * (np.clip(developed, 0, 255) / white) ** gamma)
+        levels = 255 * (np.arange(256) / 255) ** np.exp(rng.uniform(-0.35, 0.35))
+        return np.asarray(cv2.LUT(np.clip(developed, 0, 255).astype(np.uint8), levels.astype(np.uint8)), dtype=np.uint8)
 
     def sense(self, picture: Picture) -> Picture:
         """Take the picture by some sensor: its resolution, sharpness, noise and compression."""
         rng, size = self.rng, (self.side, self.side)
-        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.35, 0.7)))
+        seen = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.35, 0.7))
         if rng.random() < 0.6:
             sensor_px = max(8, round(self.side / rng.uniform(1.0, max(1.01, _COARSEST_M / self.px))))
-            small = cv2.resize(picture, (sensor_px, sensor_px), interpolation=cv2.INTER_AREA)
-            picture = cv2.resize(small, size, interpolation=int(rng.choice([cv2.INTER_LINEAR, cv2.INTER_CUBIC])))
+            small = cv2.resize(seen, (sensor_px, sensor_px), interpolation=cv2.INTER_AREA)
+            seen = cv2.resize(small, size, interpolation=int(rng.choice([cv2.INTER_LINEAR, cv2.INTER_CUBIC])))
         if rng.random() < 0.25:  # pan-sharpened: colours are coarser than brightness
-            fine = cv2.cvtColor(picture, cv2.COLOR_RGB2YCrCb)
+            fine = cv2.cvtColor(seen, cv2.COLOR_RGB2YCrCb)
             small = cv2.resize(fine, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
             fine[..., 1:] = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)[..., 1:]
-            picture = cv2.cvtColor(fine, cv2.COLOR_YCrCb2RGB)
+            seen = cv2.cvtColor(fine, cv2.COLOR_YCrCb2RGB)
         if rng.random() < 0.4:
             more, wide = rng.uniform(0.2, 1.8), rng.uniform(0.8, 2.0)
-            picture = cv2.addWeighted(picture, 1 + more, cv2.GaussianBlur(picture, (0, 0), wide), -more, 0)
+            seen = cv2.addWeighted(seen, 1 + more, cv2.GaussianBlur(seen, (0, 0), wide), -more, 0)
         if rng.random() < 0.6:
-            strong = np.float32(rng.uniform(0.5, 9.0))
-            noise = strong * self.tile(self.tiles.grain, 0)
-            picture = np.clip(picture + noise[..., None], 0, 255).astype(np.uint8)
+            noise = np.rint(np.float32(rng.uniform(0.5, 9.0)) * self.tile(self.tiles.grain, 0)).astype(np.int16)
+            seen = np.clip(seen + noise[..., None], 0, 255).astype(np.uint8)
         if rng.random() < 0.6:
-            quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 95))]
-            picture = cv2.imdecode(cv2.imencode(".jpg", picture, quality)[1], cv2.IMREAD_COLOR)
-        return np.asarray(picture, dtype=np.uint8)
+            packed = cv2.imencode(".jpg", seen, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 95))])[1]
+            seen = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR))
+        return np.asarray(seen, dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -759,7 +761,7 @@ def _direction(rng: Rng) -> NDArray[np.float64]:
     return np.array([np.cos(turn), np.sin(turn)])
 
 
-def _moved(values: NDArray[np.generic], right: int, down: int) -> NDArray[np.generic]:
+def _moved(values: NDArray[Number], right: int, down: int) -> NDArray[Number]:
     """Return a raster moved by whole pixels; 0 comes in at its edge."""
     rows, cols = values.shape
     moved = np.zeros_like(values)

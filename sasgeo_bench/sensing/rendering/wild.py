@@ -742,8 +742,9 @@ class _Boxes:
         return cls(centre=rng.uniform(0, side_px, size=(count, 2)), axis=axis, half=half)
 
     def fill(self, layer: NDArray[np.int32], values: list[int]) -> None:
-        ahead = self.axis * self.half[:, :1]
-        left = np.stack([-self.axis[:, 1], self.axis[:, 0]], axis=1) * self.half[:, 1:]
+        half = np.maximum(self.half - 0.4, 0.3)  # OpenCV fills the pixels of the outline, too
+        ahead = self.axis * half[:, :1]
+        left = np.stack([-self.axis[:, 1], self.axis[:, 0]], axis=1) * half[:, 1:]
         corners = self.centre[:, None] + np.stack([ahead + left, ahead - left, -ahead - left, left - ahead], axis=1)
         for box, value in zip(np.round((corners - 0.5) * 8).astype(np.int32), values, strict=True):
             cv2.fillConvexPoly(layer, box, value, lineType=cv2.LINE_8, shift=3)

@@ -153,7 +153,8 @@ def _stalls(parking: Shapes, grid: Grid) -> Field:
     outlines = outlines[shapely.area(outlines) > 2 * wide_m * deep_m]
     for outline, centre, axis, half in zip(outlines, *rectangles(outlines), strict=True):
         side = np.array([-axis[1], axis[0]])
-        ahead, across = np.arange(-half[0] + 2, half[0] - 1, wide_m), np.arange(-half[1] + 3, half[1] - 2.9, 1.6 * deep_m)
+        ahead = np.arange(-half[0] + 2, half[0] - 1, wide_m)
+        across = np.arange(-half[1] + 3, half[1] - 2.9, 1.6 * deep_m)  # a lane between each two rows
         places = centre + (ahead[:, None, None] * axis + across[None, :, None] * side).reshape(-1, 2)
         places = places[shapely.contains_xy(outline, *places.T)]
         more = np.array([*side, deep_m / 2])

@@ -704,7 +704,7 @@ class _Drawing:
     def sense(self, picture: Picture) -> Picture:
         """Take the picture by some sensor: its resolution, sharpness, noise and compression."""
         rng, size = self.rng, (self.side, self.side)
-        seen = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.35, 0.7))
+        seen = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.4, 0.9))
         if rng.random() < 0.6:
             sensor_px = max(8, round(self.side / rng.uniform(1.0, max(1.01, _COARSEST_M / self.px))))
             small = cv2.resize(seen, (sensor_px, sensor_px), interpolation=cv2.INTER_AREA)

@@ -25,14 +25,15 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sensing.rendering.sheet import Sheet, make_sheet
 from sasgeo_bench.sensing.rendering.wild import Ingredients, draw_picture
 
-_OPEN: Final = 20  # windows that crops are taken from in turn
+_OPEN: Final = 20  # windows that crops are taken from in turn: fewer, where they are large
+_MOST_CELLS: Final = 24_000_000  # of all of them, 12 bytes each
 _DRAWN: Final = 40  # crops of one window, on average; each has a look of its own
 _CUT: Final = 10  # of one window of a picture
 _WINDOW: Final = 4  # sides of a crop in one of a window
 _LEAST_SIDE_PX: Final = 16
 _MOST_SIDE_PX: Final = 2048
 _MOST_ZOOM: Final = 2.0
-_MOST_TRIES: Final = 2000  # poses in turn that show too little mapped ground
+_MOST_TRIES: Final = 300  # poses in turn that show too little mapped ground
 _AROUND: Final = 0.6  # share of windows around something that is mapped
 _LEAST_KNOWN: Final = 0.5  # of a crop
 _MARGIN_M: Final = 60.0  # around a window: what stands there has yards and shadows in it
@@ -181,6 +182,11 @@ class _Shape:
         return self.side_px * self.pixel_m * self.zoom / math.sqrt(2)
 
     @property
+    def most_open(self) -> int:
+        """Return how many windows are open at a time, at most."""
+        return max(2, min(_OPEN, _MOST_CELLS // (_WINDOW * self.side_px) ** 2))
+
+    @property
     def window_m(self) -> float:
         """Return the side of the windows that crops are taken from, metres."""
         return _WINDOW * self.side_px * self.pixel_m
@@ -220,12 +226,12 @@ def _crops(sources: Sequence[_Source], shape: _Shape, *, each: int) -> Iterator[
     opened = 0
     for number in itertools.count():
         for attempt in range(_MOST_TRIES):
-            is_new = len(windows) < _OPEN or attempt % _OPEN == _OPEN - 1
+            is_new = len(windows) < shape.most_open or attempt % _OPEN == _OPEN - 1
             if is_new or poses.random() < 1 / each:
                 window = sources[opened % len(sources)].open(poses)
                 opened += 1
-                if len(windows) == _OPEN:
-                    del windows[int(poses.integers(_OPEN))]
+                if len(windows) == shape.most_open:
+                    del windows[int(poses.integers(shape.most_open))]
                 windows.append(window)
             else:
                 window = windows[int(poses.integers(len(windows)))]

@@ -192,6 +192,22 @@ def test_shadows_fall_beside_what_stands_up_and_darken(village):
     assert is_dark[~house].sum() > 50
 
 
+@pytest.mark.parametrize("rows", [(), *((row,) for row in VILLAGE)])
+def test_a_map_with_one_thing_or_none_is_drawn_too(rows):
+    sheet = sheet_of(*rows)
+    for seed in range(4):
+        assert picture(sheet, Ingredients(), seed).std() > 1
+
+
+def test_a_stream_is_not_seen_in_the_lake_that_it_crosses():
+    stream = ("waterway", shapely.LineString([(EAST - 60, NORTH - 20), (EAST + 60, NORTH - 24)]), 6.0)
+    lake = ("water", shapely.box(EAST - 30, NORTH - 40, EAST + 30, NORTH + 10), np.nan)
+    sheet = sheet_of(stream, lake)
+    in_lake = seen(sheet)[CLASSES.index("water")] == PRESENT
+    shown = [picture(sheet, Ingredients.none(), seed)[in_lake] for seed in range(6)]
+    assert all((colours == colours[0]).all() for colours in shown)
+
+
 def test_looks_of_one_place_are_unlike_each_other(village):
     means = np.array([picture(village, Ingredients(), seed).mean(axis=(0, 1)) for seed in range(24)])
     assert (means.std(axis=0) > 15).all()

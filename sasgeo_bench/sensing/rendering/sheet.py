@@ -80,6 +80,8 @@ def make_sheet(
     order = sorted(load_taxonomy().classes, key=lambda item: item.paint)
     looks = [look for look in dict.fromkeys(item.look for item in order) if look in shapes]
     flat = [(look, shapes[look]) for look in looks if look not in ("building", "none")]
+    # Areas of a look hide its lines: a river has no stream in it
+    flat = [(name, part.part(np.argsort(np.isnan(part.width_m), kind="stable"))) for name, part in flat]
     look = np.repeat([name for name, _ in flat], [len(part) for _, part in flat]).astype(str)
     areas = np.concatenate([*(part.areas() for _, part in flat), _NONE])
     number = burn_numbers(areas, window)

@@ -304,7 +304,8 @@ class _Drawing:
             table.colour[rows] = self.colours.draw(_BALLAST, count, spread)
             table.grain[rows] = 0.1
         elif look == "water":
-            table.colour[rows] = self.colours.draw(_WATER, count, spread)
+            # Mostly of one colour: a river is mapped in pieces
+            table.colour[rows] = self.colours.draw(_WATER, count if rng.random() < 0.3 else 1, spread)
             table.grain[rows], table.mottle[rows] = rng.uniform(0, 0.04), rng.uniform(0, 0.08)
         elif look == "green":
             self.lay_green(rows, spread)

@@ -202,7 +202,7 @@ def test_a_map_with_one_thing_or_none_is_drawn_too(rows):
 def test_a_stream_is_not_seen_in_the_lake_that_it_crosses():
     stream = ("waterway", shapely.LineString([(EAST - 60, NORTH - 20), (EAST + 60, NORTH - 24)]), 6.0)
     lake = ("water", shapely.box(EAST - 30, NORTH - 40, EAST + 30, NORTH + 10), np.nan)
-    sheet = sheet_of(stream, lake)
+    sheet = sheet_of(lake, stream)
     in_lake = seen(sheet)[CLASSES.index("water")] == PRESENT
     shown = [picture(sheet, Ingredients.none(), seed)[in_lake] for seed in range(6)]
     assert all((colours == colours[0]).all() for colours in shown)

@@ -177,7 +177,8 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
     seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name, str(suite.card.version)))
     suite = replace(suite, variants=suite.usable(scene))
     if isinstance(suite, FlightSuite):
-        airspace = Airspace(region=base, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group)
+        over = base if scene.pictured is None else base.within(scene.pictured.footprint)
+        airspace = Airspace(region=over, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group)
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
         airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))
         pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice)

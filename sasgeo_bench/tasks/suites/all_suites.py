@@ -62,6 +62,7 @@ FLIGHT_SUITES: Final[dict[str, FlightSuite]] = {
         flights.FLIGHT_ALIAS,
         flights.FLIGHT_OFF_MAP,
         flights.FLIGHT_IMAGE,
+        real_image.FLIGHT_REAL_IMAGE,
     )
 }
 # With the controls, which every board draws in addition to its experiment.

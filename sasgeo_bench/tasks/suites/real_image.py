@@ -1,27 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suite of real pictures: views cut out of the imagery of a region, searched on its map, worse and older ones."""
+"""Suites of real pictures, cut out of the imagery of a region: real-image, single views, and flight-real-image."""
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
-from sasgeo_bench.regions.imagery import Imagery
 from sasgeo_bench.sensing.accumulation import believed_steps, steps_between
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
 from sasgeo_bench.tasks.frame_evidence import poses_before
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
-from sasgeo_bench.tasks.pictured_ground import GROUNDS, Floats, PicturedGround
+from sasgeo_bench.tasks.pictured_ground import GROUNDS, Cut, PicturedGround
 from sasgeo_bench.tasks.query import REAL, Detector, PriorGroup, Role
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import QueryDraft, Scene, Site, Suite, SuiteCard, Variant, ViewRequest
+from sasgeo_bench.tasks.suites.flights import AGAIN, LONGEST_M, SEQUENCE, START, FlightSuite, Mission
 from sasgeo_bench.tasks.suites.pictures import AROUND, ODOMETRY, unseen
 
 SIDES_M: Final = (384.0, 256.0, 192.0, 128.0, 96.0)
@@ -36,6 +33,7 @@ VIEW, DEGRADED, OLDER, ABSENT, FRAMES = (
     "R4 another town",
     "R5 frames",
 )
+NO_IMAGERY: Final = "no real imagery ([[imagery]] in its region file)"
 _OF: Final = f"{OLDER} of "  # before the date
 TURNED: Final = "turned picture"
 COUNTS: Final = (3.0, 9.0)  # of frames
@@ -45,7 +43,6 @@ _FINE_CELL_M: Final = 0.5
 _PICTURE: Final = 1.25  # times the view's side is what a picture shows
 _MOST_PX: Final = 768
 _HEIGHT_M: Final = 2000.0  # of the camera that a mosaic stands for: from there nothing leans
-_UNKNOWN_BIT: Final = np.uint32(1 << 31)
 _TRIES: Final = 4000
 
 
@@ -80,7 +77,7 @@ class RealImageSuite(Suite):
     def lack(self, scene: Scene) -> str | None:
         """Return that there is no imagery or too coarse a one, or what any suite lacks."""
         if scene.pictured is None:
-            return "no real imagery ([[imagery]] in its region file)"
+            return NO_IMAGERY
         gsd_m, side_m = scene.pictured.own_gsd_m, max(variant.side_m for variant in self.variants)
         if LEAST_PX * gsd_m > side_m:
             return f"its picture has pixels of {gsd_m:g} m, fewer than {LEAST_PX} along a view of {side_m:g} m"
@@ -132,16 +129,7 @@ class RealImageSuite(Suite):
     def ground_at(self, scene: Scene, pose: Pose) -> str | None:
         """Return the kind of ground of the main view; None where the picture lacks a part of some view."""
         assert scene.pictured is not None  # noqa: S101 - by `lack`
-        return scene.pictured.ground(pose, self.main_side_m) if self._is_shown(scene.pictured, pose) else None
-
-    def _is_shown(self, pictured: PicturedGround, pose: Pose) -> bool:
-        if not pictured.shows(np.array([(pose.easting_m, pose.northing_m)])).all():
-            return False  # most places of a map beyond its picture
-        sides_m = sorted(
-            {side_m for variant in self.variants for side_m in (variant.side_m, _PICTURE * variant.side_m)}
-        )
-        is_within = all(pictured.shows_corners(pose, side_m) for side_m in sides_m)
-        return is_within and all(pictured.shown_share(pose, side_m) >= LEAST_SHOWN for side_m in sides_m)
+        return scene.pictured.ground(pose, self.main_side_m) if _is_shown(scene.pictured, pose, self.variants) else None
 
     def draw(self, shot: ViewRequest) -> QueryDraft:
         """Cut the pictures of a shot; their evidence is unknown until a segmenter has seen them."""
@@ -154,7 +142,7 @@ class RealImageSuite(Suite):
         classes = pictured.state.classes
         return QueryDraft(
             evidence=unseen(classes, variant.view_cells, variant.cell_size_m),
-            frames=tuple(self._frame(cut, place) for cut, place in zip(cuts, believed, strict=True)),
+            frames=tuple(_frame(cut, place, self.card) for cut, place in zip(cuts, believed, strict=True)),
             labels=tuple(FrameLabels.of(classes, cut.labels) for cut in cuts),
             is_present=is_here,
             has_pose=is_here,
@@ -162,15 +150,10 @@ class RealImageSuite(Suite):
             kind=f"{VIEW.partition(' ')[0]} {here.ground(pose, variant.side_m)}" if variant.kind == VIEW else "",
             group=None if variant.radius_m is None else replace(self.card.group, radius_m=variant.radius_m),
             density=site.density,
-            measured={
-                "gsd_m": round(cuts[-1].pixel_m, 3),
-                "map_off_m": round(float(np.hypot(*pictured.off_m)), 2),
-                "pictured_share": round(min(float(cut.is_known.mean()) for cut in cuts), 4),
-                "building_share": cuts[-1].share(classes, "building"),
-            },
+            measured=_measured(pictured, cuts),
         )
 
-    def _cuts(self, shot: ViewRequest, pictured: PicturedGround, pose: Pose) -> tuple[list["_Cut"], list[Pose]]:
+    def _cuts(self, shot: ViewRequest, pictured: PicturedGround, pose: Pose) -> tuple[list[Cut], list[Pose]]:
         """Return the pictures of a shot, and where each is believed to be taken in the frame of the view."""
         assert shot.scene.pictured is not None  # noqa: S101 - by `lack`
         is_one = shot.variant.kind != FRAMES
@@ -187,18 +170,8 @@ class RealImageSuite(Suite):
         for stop in stops:
             east_m, north_m = pose.to_map(np.array([(stop.easting_m, stop.northing_m)]))[0].tolist()
             taken = replace(pose, easting_m=east_m, northing_m=north_m)
-            cuts.append(_Cut.of(pictured, taken, pixel_m=side_m / width_px, width_px=width_px))
+            cuts.append(pictured.cut(taken, side_m, width_px))
         return cuts, believed
-
-    def _frame(self, cut: "_Cut", place: Pose) -> Frame:
-        distance_m = float(np.hypot(place.easting_m, place.northing_m))
-        return Frame(
-            picture=encode_webp(cut.rgb),
-            camera=_camera(cut, place),
-            height_sigma_m=round(_HEIGHT_M * self.card.group.scale_sigma, 2),
-            position_sigma_m=round(ODOMETRY.position_share * distance_m, 3),
-            yaw_sigma_deg=round(ODOMETRY.yaw_deg_per_km * math.sqrt(distance_m / 1000), 3),
-        )
 
     def _elsewhere(self, shot: ViewRequest) -> tuple[PicturedGround, Site]:
         """Return a place of the other picture, of the site's kind of ground where one is found."""
@@ -210,7 +183,7 @@ class RealImageSuite(Suite):
         found: Pose | None = None
         for point in shot.seeds.rng("elsewhere").uniform((west, south), (east, north), (_TRIES, 2)):
             pose = replace(shot.site.pose, easting_m=float(point[0]), northing_m=float(point[1]))
-            if not (self._is_shown(there, pose) and state.is_mapped(point, shot.scene.view_reach_m)):
+            if not (_is_shown(there, pose, self.variants) and state.is_mapped(point, shot.scene.view_reach_m)):
                 continue
             found = found or pose
             if there.ground(pose, self.main_side_m) == wanted:
@@ -221,61 +194,43 @@ class RealImageSuite(Suite):
         return there, replace(shot.site, pose=found, density=there.drawn_share(found, self.main_side_m))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Cut:
-    """A square picture of some ground: colours (H, W, 3), where there are any (H, W), and the map's labels."""
-
-    rgb: NDArray[np.uint8]
-    is_known: NDArray[np.bool_]
-    labels: NDArray[np.uint8]
-    pixel_m: float
-
-    @classmethod
-    def of(cls, pictured: PicturedGround, pose: Pose, *, pixel_m: float, width_px: int) -> "_Cut":
-        """Cut the picture around a pose; its pixels are `pixel_m` wide at scale 1."""
-        right = (np.arange(width_px) + 0.5 - width_px / 2) * pixel_m
-        across, ahead = np.meshgrid(right, -right)
-        # Easting and northing of each pixel, shape (H, W, 2)
-        ground_m = pose.to_map(np.stack((across.ravel(), ahead.ravel()), axis=1)).reshape(width_px, width_px, 2)
-        rgb, is_known = _pixels(pictured.imagery, ground_m + pictured.off_m)
-        return cls(rgb=rgb, is_known=is_known, labels=_labels(pictured.state, ground_m, is_known), pixel_m=pixel_m)
-
-    def share(self, classes: tuple[str, ...], name: str) -> float:
-        """Return the share of a class on the picture; 0 where the map does not know of it."""
-        return round(float((self.labels[classes.index(name)] == PRESENT).mean()), 4) if name in classes else 0.0
-
-
-def _pixels(imagery: Imagery, seen_m: Floats) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return the colours of places of the imagery, (H, W, 2), shape (H, W, 3), and which of them it shows, (H, W)."""
-    pixel_m = float(np.hypot(*(seen_m[0, 1] - seen_m[0, 0])))
-    low, high = seen_m.min(axis=(0, 1)) - 2 * pixel_m, seen_m.max(axis=(0, 1)) + 2 * pixel_m
-    bounds_m = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    window = imagery.read(bounds_m, gsd_m=max(pixel_m, imagery.record.gsd_m))
-    uv = (window.grid.to_uv(seen_m.reshape(-1, 2)) - 0.5).astype(np.float32).reshape(seen_m.shape)
-    rgb = cv2.remap(window.rgb, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
-    known = cv2.remap(window.is_known.view(np.uint8), uv[..., 0], uv[..., 1], cv2.INTER_NEAREST)
-    return np.asarray(rgb, dtype=np.uint8), np.asarray(known > 0)
-
-
-def _labels(state: State, ground_m: Floats, is_known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Return what the map says of each pixel, shape (C, H, W): UNKNOWN beyond its ground or the imagery."""
-    row, col = state.grid.to_cells(ground_m.reshape(-1, 2)).T
-    inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
-    bits = np.full(len(row), _UNKNOWN_BIT)
-    bits[inside] = state.bits.bits[row[inside], col[inside]]
-    states = [(bits >> np.uint32(at) & np.uint32(1)).astype(np.uint8) for at in range(len(state.classes))]
-    found = np.stack(states).reshape(-1, *is_known.shape)
-    found[:, ((bits & _UNKNOWN_BIT) > 0).reshape(is_known.shape) | ~is_known] = UNKNOWN
-    return found
-
-
 def _turned(shot: ViewRequest) -> Pose:
     """Return the pose of the falsifier: turned by one, two or three quarters, it shows the very same ground."""
     site, quarters = shot.site.pose, int(shot.seeds.rng("turn").integers(1, 4))
     return replace(site, yaw_deg=(site.yaw_deg + 90.0 * quarters) % 360)
 
 
-def _camera(cut: _Cut, place: Pose) -> Camera:
+def _is_shown(pictured: PicturedGround, pose: Pose, variants: Sequence[Variant]) -> bool:
+    """Return whether the imagery shows every view of a place, and the picture of each, up to their corners."""
+    if not pictured.shows(np.array([(pose.easting_m, pose.northing_m)])).all():
+        return False  # most places of a map beyond its picture
+    sides_m = sorted({side_m for variant in variants for side_m in (variant.side_m, _PICTURE * variant.side_m)})
+    is_within = all(pictured.shows_corners(pose, side_m) for side_m in sides_m)
+    return is_within and all(pictured.shown_share(pose, side_m) >= LEAST_SHOWN for side_m in sides_m)
+
+
+def _measured(pictured: PicturedGround, cuts: Sequence[Cut]) -> dict[str, float]:
+    return {
+        "gsd_m": round(cuts[-1].pixel_m, 3),
+        "map_off_m": round(float(np.hypot(*pictured.off_m)), 2),
+        "pictured_share": round(min(float(cut.is_known.mean()) for cut in cuts), 4),
+        "building_share": round(cuts[-1].share(pictured.state.classes, "building"), 4),
+    }
+
+
+def _frame(cut: Cut, place: Pose, card: SuiteCard) -> Frame:
+    """Return a picture with its camera, which is believed to stand at a place in the frame of the view."""
+    distance_m = float(np.hypot(place.easting_m, place.northing_m))
+    return Frame(
+        picture=encode_webp(cut.rgb),
+        camera=_camera(cut, place),
+        height_sigma_m=round(_HEIGHT_M * card.group.scale_sigma, 2),
+        position_sigma_m=round(ODOMETRY.position_share * distance_m, 3),
+        yaw_sigma_deg=round(ODOMETRY.yaw_deg_per_km * math.sqrt(distance_m / 1000), 3),
+    )
+
+
+def _camera(cut: Cut, place: Pose) -> Camera:
     """Return the camera that a picture stands for, in the frame of the view."""
     width_px = cut.rgb.shape[1]
     focal_px, centre_px = _HEIGHT_M / cut.pixel_m, width_px / 2
@@ -351,4 +306,88 @@ REAL_IMAGE: Final = RealImageSuite(
         *(_variant("stress", FRAMES, 256.0, strength=count) for count in COUNTS),
         _variant("falsifier", TURNED, SIDES_M[0]),
     ),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealFlightSuite(FlightSuite):
+    """Flights over the imagery of a region: each view is one picture cut out of it, all of which it shows."""
+
+    @property
+    def is_pictured(self) -> bool:
+        """Return True."""
+        return True
+
+    @property
+    def detectors(self) -> tuple[Detector, ...]:
+        """Return that pictures are real."""
+        return (REAL,)
+
+    def lack(self, scene: Scene) -> str | None:
+        """Return that there is no imagery, or what any suite lacks."""
+        return super().lack(scene) if scene.pictured is not None else NO_IMAGERY
+
+    def clear_m(self, scene: Scene) -> float:
+        """Return half the side of the square that must be mapped: what a picture shows, in any heading."""
+        return _PICTURE * super().clear_m(scene)
+
+    def ground_at(self, scene: Scene, pose: Pose) -> str | None:
+        """Return "" where the imagery shows the whole picture; None elsewhere."""
+        assert scene.pictured is not None  # noqa: S101 - by `lack`
+        return "" if _is_shown(scene.pictured, pose, self.variants) else None
+
+    def draw(self, shot: ViewRequest) -> QueryDraft:
+        """Cut the picture of one view; its evidence is unknown until a segmenter has seen it."""
+        variant, pictured = shot.variant, shot.scene.pictured
+        assert pictured is not None  # noqa: S101 - by `lack`
+        side_m = _PICTURE * variant.side_m
+        cut = pictured.cut(shot.site.pose, side_m, min(_MOST_PX, round(side_m / pictured.imagery.record.gsd_m)))
+        classes = pictured.state.classes
+        return QueryDraft(
+            evidence=unseen(classes, variant.view_cells, variant.cell_size_m),
+            frames=(_frame(cut, Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0), self.card),),
+            labels=(FrameLabels.of(classes, cut.labels),),
+            measured=_measured(pictured, [cut]),
+        )
+
+
+DRIFTS: Final = ("vo-mono-survey", "vio-mono")  # measured profiles that drift least and most
+_KIND: Final = "F10"
+_SIDE_M: Final = 128.0
+
+
+def _mission(variant: Variant) -> Mission:
+    is_stress = variant.role == "stress"
+    return Mission(
+        profile=variant.kind.removeprefix(f"{_KIND} ") if is_stress else "perfect",
+        draw=AGAIN if variant.role == "falsifier" else "",
+    )
+
+
+FLIGHT_REAL_IMAGE: Final = RealFlightSuite(
+    card=SuiteCard(
+        name="flight-real-image",
+        version=1,
+        title="Flights over real pictures (F10)",
+        what="A flight of 1 or 2 km over the imagery of a region: a picture of 128 m every 40 to 60 m, and an odometer "
+        "that drifts as the least and the most that was measured; the control's does not. A segmenter makes the "
+        "evidence.",
+        separates="What many real pictures give that one does not from what drift takes.",
+        falsifier="The same pictures without drift: scores as in the control.",
+        strength_unit="place of the odometer in the order of drift",
+        needs=("imagery",),
+        group=START,
+        tracks=SEQUENCE,
+        min_density=0.03,
+    ),
+    variants=(
+        _variant("control", "no drift", _SIDE_M),
+        *(
+            _variant("stress", f"{_KIND} {name}", _SIDE_M, strength=float(order))
+            for order, name in enumerate(DRIFTS, start=1)
+        ),
+        _variant("falsifier", "no drift again", _SIDE_M),
+    ),
+    mission=_mission,
+    longest_m=LONGEST_M,
 )

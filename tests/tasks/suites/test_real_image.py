@@ -320,6 +320,33 @@ def test_frames_lie_around_the_last_one_which_is_the_view_alone(over):
     assert off_m[:-1].min() > 0  # the odometer drifts
 
 
+# --- flights
+
+
+def test_a_flight_over_a_mosaic_stays_on_it_and_shows_where_its_truths_are(village):
+    request = request_of(village.spec, village.out, village.folder, suite="flight-real-image", count=2)
+    (task,) = make_tasks(request)
+    truths = {item.query_id: item for item in read_truths(village.out / "truth" / "flight-real-image" / "village")}
+    found = {name: item for name, _, item in read_labels(village.out / "truth" / "flight-real-image" / "village")}
+    state, seen, off_m = village.pictured().state, Counter(), {}
+    for query in read_queries(task.folder):
+        truth = truths[query.query_id]
+        assert len(query.frames) == 1
+        assert truth.measured["pictured_share"] >= 0.97
+        assert truth.pose.northing_m < SOUTH + SHOWN_M - 80
+        assert (query.prior.center_m is None) == (query.step.frame > 0)
+        house = state.view(truth.pose, size_cells=128, cell_size_m=1.0).layer("building") == PRESENT
+        rows = found[query.query_id].labels[0] == PRESENT  # of a picture that is 1.25 times as wide
+        middle = rows[32:-32, 32:-32].reshape(128, 2, 128, 2).mean(axis=(1, 3)) > 0.5
+        assert (middle == house).mean() > 0.97
+        seen[truth.kind] += 1
+        off_m.setdefault(truth.kind, []).append(truth)
+    assert len(set(seen.values())) == 1
+    assert set(seen) == {"no drift", "no drift again", "F10 vo-mono-survey", "F10 vio-mono"}
+    poses = [[(one.pose.easting_m, one.pose.yaw_deg) for one in listed] for listed in off_m.values()]
+    assert all(sorted(one) == sorted(poses[0]) for one in poses)
+
+
 # --- tasks on disk
 
 

@@ -266,20 +266,18 @@ def _variant(
 
 
 def _of_sides(variants: Iterable[Variant], sides_m: Sequence[float]) -> tuple[Variant, ...]:
-    """Return variants with views of these sides alone, widest first: the control has the largest, R1 all smaller ones.
+    """Return variants with views of these sides alone, widest first: the control has the largest, R1 has all.
 
-    Others have the side below theirs if theirs is not there.
+    Others have the side below theirs if theirs is not there; several frames need their own.
     """
-    largest_m, found = sides_m[0], []
+    found = []
     for variant in variants:
-        is_there = variant.side_m in sides_m
-        if variant.role != "stress":
-            found.append(_variant(variant.role, variant.kind, largest_m, disc_m=variant.radius_m))
-        elif variant.kind in (VIEW, FRAMES):
-            found += [variant] if is_there and (variant.side_m < largest_m or variant.kind == FRAMES) else []
-        else:
-            below_m = next((side_m for side_m in sides_m if side_m <= variant.side_m), sides_m[-1])
-            found.append(_variant("stress", variant.kind, below_m, disc_m=variant.radius_m))
+        wanted_m = sides_m[0] if variant.role != "stress" else variant.side_m
+        if wanted_m in sides_m and variant.role == "stress":
+            found.append(variant)
+        elif variant.kind not in (VIEW, FRAMES):
+            side_m = next((side_m for side_m in sides_m if side_m <= wanted_m), sides_m[-1])
+            found.append(_variant(variant.role, variant.kind, side_m, disc_m=variant.radius_m))
     return tuple(dict.fromkeys(found))
 
 
@@ -300,7 +298,7 @@ REAL_IMAGE: Final = RealImageSuite(
     ),
     variants=(
         *(_variant("control", "control", SIDES_M[0], disc_m=disc_m) for disc_m in (None, DISC_M)),
-        *(_variant("stress", VIEW, side_m, disc_m=disc_m) for disc_m in (None, DISC_M) for side_m in SIDES_M[1:]),
+        *(_variant("stress", VIEW, side_m, disc_m=disc_m) for disc_m in (None, DISC_M) for side_m in SIDES_M),
         *(_variant("stress", kind, side_m) for kind in (DEGRADED, ABSENT) for side_m in (256.0, 128.0)),
         _variant("stress", OLDER, 256.0),
         *(_variant("stress", FRAMES, 256.0, strength=count) for count in COUNTS),

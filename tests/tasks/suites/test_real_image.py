@@ -136,7 +136,7 @@ def test_the_whole_suite_asks_five_sides_in_two_discs_and_what_else_its_card_say
     sides = {(item.kind, item.radius_m): set() for item in REAL_IMAGE.variants}
     for item in REAL_IMAGE.variants:
         sides[item.kind, item.radius_m].add(item.side_m)
-    assert sides[VIEW, None] == sides[VIEW, 250.0] == {256.0, 192.0, 128.0, 96.0}
+    assert sides[VIEW, None] == sides[VIEW, 250.0] == {384.0, 256.0, 192.0, 128.0, 96.0}
     assert sides["control", None] == sides["control", 250.0] == sides[TURNED, None] == {384.0}
     assert {item.strength for item in REAL_IMAGE.variants if item.kind == FRAMES} == {3.0, 9.0}
     assert len({item.name for item in REAL_IMAGE.variants}) == len(REAL_IMAGE.variants)
@@ -151,7 +151,7 @@ def test_no_view_is_larger_than_the_region_allows_and_each_is_drawn_once(largest
     (control,) = {item.side_m for item in fitting if item.role != "stress"}
     assert control == max(sides)
     views = {item.side_m for item in fitting if item.kind == VIEW}
-    assert views == {side for side in (256.0, 192.0, 128.0, 96.0) if side < control}
+    assert views == {side for side in (384.0, 256.0, 192.0, 128.0, 96.0) if side <= control}
     assert any(item.kind == DEGRADED for item in fitting)
 
 
@@ -210,7 +210,7 @@ def test_every_view_and_picture_of_every_site_is_shown(over):
     north = [site.pose.northing_m for site in sites]
     assert max(north) < SOUTH + SHOWN_M - 96.0
     assert max(north) > SOUTH + SHOWN_M - 250.0  # as near to the rim as pictures allow, about
-    for site in sites:
+    for site in sorted(sites, key=lambda one: -one.pose.northing_m)[:4]:
         for variant in suite.variants:
             shot = ViewRequest(scene=scene, site=site, variant=variant, seeds=SEEDS.under("site", site.index))
             draft = suite.draw(shot)
@@ -237,7 +237,7 @@ def test_a_hole_that_hides_a_small_view_makes_no_site(village):
 
 def test_places_of_sites_follow_no_lattice(village):
     scene = scene_of(village.pictured())
-    sites = [site for root in range(6) for site in sites_of(scene, 8, root=root)]
+    sites = [site for root in range(4) for site in sites_of(scene, 8, root=root)]
     grid = scene.pictured.imagery.grid
     phases = np.array([grid.to_uv(np.array([site.en_m]))[0] % 1 for site in sites])
     assert (np.histogram2d(*phases.T, bins=2, range=[(0, 1), (0, 1)])[0] > 0.12 * len(sites)).all()
@@ -418,6 +418,8 @@ def test_a_small_place_has_its_largest_view_in_both_discs_and_another_town_in_on
         ("r250-weak-s3", "control", 0.0): sites,
         ("r500-weak-s3", TURNED, 0.0): sites,
         ("r500-weak-s3", ABSENT, 96.0): sites,
+        ("r500-weak-s3", "R1 built", 96.0): sites,
+        ("r250-weak-s3", "R1 built", 96.0): sites,
     }
     assert {truth.detector for _, truth in pairs(drawn)} == {"real"}
     assert {(truth.kind, truth.strength) for _, truth in pairs(drawn, "hamlet+real-image")} == {(DEGRADED, 96.0)}

@@ -11,7 +11,7 @@ import rasterio
 import shapely
 from rasterio.windows import Window
 
-from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError, ImageryError
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, observe
 from sasgeo_bench.regions.imagery import OffsetRecord
@@ -21,7 +21,7 @@ from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import read_labels
-from sasgeo_bench.tasks.pictured_ground import BUILT, OPEN, PicturedGround
+from sasgeo_bench.tasks.pictured_ground import BUILT, GROUNDS, OPEN, PicturedGround
 from sasgeo_bench.tasks.split import SplitFile, blocks_of, make_split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, ViewRequest
@@ -241,6 +241,26 @@ def test_places_of_sites_follow_no_lattice(village):
     grid = scene.pictured.imagery.grid
     phases = np.array([grid.to_uv(np.array([site.en_m]))[0] % 1 for site in sites])
     assert (np.histogram2d(*phases.T, bins=2, range=[(0, 1), (0, 1)])[0] > 0.12 * len(sites)).all()
+
+
+@pytest.mark.real
+def test_a_picture_of_half_a_region_carries_as_many_sites_as_are_asked_for(real_extracts, tmp_path):
+    spec = read_region_file(list_region_files()["pardubice-ortho"])
+    try:
+        plan = plan_build(spec, out=tmp_path, extract_folders=[real_extracts])
+    except ImageryError as error:
+        pytest.skip(str(error))
+    build_region(plan)
+    region = read_region(plan.folder)
+    pictured = PicturedGround(state=State.of(region), imagery=region.imagery)
+    assert region.imagery.record.share < 0.5
+    scene = scene_of(pictured, view_reach_m=384 / np.sqrt(2) * largest_scale(REAL_IMAGE.card.group))
+    suite = replace(REAL_IMAGE, variants=REAL_IMAGE.usable(scene))
+    sites = choose_sites(scene, suite, count=36, seeds=SEEDS, group=suite.card.group)
+    kinds = Counter(pictured.ground(site.pose, 192.0) for site in sites)
+    assert set(kinds) == set(GROUNDS)
+    assert min(kinds.values()) >= 6
+    assert min(pictured.shown_share(site.pose, 1.25 * 384.0) for site in sites) >= 0.97
 
 
 # --- queries

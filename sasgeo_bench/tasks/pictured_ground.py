@@ -39,8 +39,8 @@ class PicturedGround:
 
     Examples
     --------
-    `PicturedGround(state=State.of(region), imagery=region.imagery).ground(pose, 192.0)` says "built" of 192 m x 192 m of
-    a town, and `.shown_share(pose, 192.0)` 0.5 where the rim of the picture runs through the middle of that square.
+    `PicturedGround(state=State.of(region), imagery=region.imagery).ground(pose, 192.0)` says "built" of a square of
+    192 m in a town, and `.shown_share(pose, 192.0)` 0.5 where the rim of the picture runs through its middle.
     """
 
     state: State

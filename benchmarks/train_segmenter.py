@@ -5,7 +5,7 @@
     .venv/bin/python benchmarks/train_segmenter.py --out out --name shipped --steps 4000
 
 `--out` holds built regions. Crops are drawn from the maps of `--drawn` and cut out of the pictures over `--real`, as
-`sasgeo_bench.sensing.crops` yields them; a step takes 16. The state is kept in `--out`/segmenters/osm_unet every few
+`sasgeo_bench.sensing.crops` yields them. The state is kept in `--out`/segmenters/osm_unet every few
 minutes, and the same command goes on from there. The same command gives the same weights on one machine and thread; a
 run that was cut off, too. At the end NAME.onnx lies beside the state; `--ship` puts it where the plugin reads it.
 """
@@ -30,22 +30,20 @@ import torch
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from sasgeo_baselines.segmenters.osm_unet import CLASSES, WEIGHTS, normalized
-from sasgeo_bench.sensing.crops import Crop, drawn_crops, real_crops
 from torch import nn
 from torch.nn import functional
 
 import sasgeo_bench as sgb
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.sensing.crops import Crop, drawn_crops, real_crops
 
 WIDTHS: Final = (24, 40, 64, 96, 128)  # channels at cells of 1, 2, 4, 8 and 16 m
 SIDE_PX: Final = 256
 PIXEL_M: Final = 0.5
 CELL_PX: Final = 2  # a side of the cells that the network answers
-BATCH: Final = 16
-RATE: Final = 3e-3  # of learning, at its highest
 RISE: Final = 200  # steps in which it rises; then it falls as a cosine
 DECAY: Final = 1e-3
-PART: Final = 250  # steps between which the state is kept, and of one seed
+PART: Final = 1000  # steps between which the state is kept, and of one seed
 ZOOM: Final = 1.4
 WHOLE: Final = (0.0, 1.0, 0.0, 1.0)  # of a picture: west, east, north, south
 LEAST_CELLS: Final = 2000  # of a class in a step: fewer weigh less
@@ -204,14 +202,14 @@ def sources_of(drawn: Sequence[str], real: Sequence[str], drawn_share: float, ou
     return found
 
 
-def batches(sources: Sequence[Source], part: int) -> Iterator[tuple[torch.Tensor, ...]]:
+def batches(sources: Sequence[Source], part: int, size: int) -> Iterator[tuple[torch.Tensor, ...]]:
     """Yield planes, wanted shares and weights of each step of a part."""
     opened = [one.crops(part * len(sources) + number) for number, one in enumerate(sources)]
     shares = [one.share for one in sources]
     rng = np.random.default_rng([1, part])
     for _ in range(PART):
         parts = []
-        for at in rng.choice(len(sources), size=BATCH, p=shares):
+        for at in rng.choice(len(sources), size=size, p=shares):
             crop = next(opened[at])
             rgb = crop.rgb if sources[at].box is None else varied(crop.rgb, rng)
             parts.append((normalized(rgb), *lesson(crop)))
@@ -254,13 +252,15 @@ def export(net: Net, path: Path) -> None:
     onnx.save(model, path)
 
 
-def train(sources: Sequence[Source], steps: int, path: Path) -> Net:
+def train(sources: Sequence[Source], path: Path, given: argparse.Namespace) -> Net:
     """Teach a network, or go on with one; `path` keeps its state."""
     torch.manual_seed(0)
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
     net = Net().to(memory_format=torch.channels_last)
-    optimizer = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=DECAY)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=DECAY)
     done = 0
+    if given.begin is not None and not path.exists():
+        net.load_state_dict(torch.load(given.begin, weights_only=True)["net"])
     if path.exists():
         state = torch.load(path, weights_only=True)
         net.load_state_dict(state["net"])
@@ -268,11 +268,11 @@ def train(sources: Sequence[Source], steps: int, path: Path) -> Net:
         done = state["done"]
     began = time.perf_counter()
     net.train()
-    while done < steps:
+    while done < given.steps:
         total = 0.0
-        for planes, wanted, weights in batches(sources, done // PART):
+        for planes, wanted, weights in batches(sources, done // PART, given.batch):
             for group in optimizer.param_groups:
-                group["lr"] = RATE * min((done + 1) / RISE, 1) * (1 + math.cos(math.pi * done / steps)) / 2
+                group["lr"] = given.rate * min((done + 1) / RISE, 1) * (1 + math.cos(math.pi * done / given.steps)) / 2
             with torch.autocast("cpu", torch.bfloat16):
                 found = net(planes.to(memory_format=torch.channels_last))
             loss = loss_of(found.float(), wanted, weights)
@@ -282,7 +282,9 @@ def train(sources: Sequence[Source], steps: int, path: Path) -> Net:
             optimizer.step()
             total += float(loss.detach())
             done += 1
-        print(f"{done} of {steps} steps in {time.perf_counter() - began:.0f} s, loss {total / PART:.3f}", flush=True)
+        print(
+            f"{done} of {given.steps} steps in {time.perf_counter() - began:.0f} s, loss {total / PART:.3f}", flush=True
+        )
         torch.save(
             {"net": net.state_dict(), "optimizer": optimizer.state_dict(), "done": done}, path.with_suffix(".new")
         )
@@ -300,13 +302,16 @@ def main() -> None:
         "--real", nargs="*", default=REAL, help="regions with pictures: NAME, or NAME:WEST,EAST,NORTH,SOUTH"
     )
     parser.add_argument("--drawn-share", type=float, default=0.5, help="of all crops")
-    parser.add_argument("--steps", type=int, default=5000, help=f"of {BATCH} crops; rounded up to parts of {PART}")
+    parser.add_argument("--steps", type=int, default=5000, help=f"rounded up to parts of {PART}")
+    parser.add_argument("--batch", type=int, default=4, help="crops of a step")
+    parser.add_argument("--rate", type=float, default=2e-3, help="of learning, at its highest")
+    parser.add_argument("--begin", type=Path, help="a kept state (*.pt) whose weights it begins with, else drawn ones")
     parser.add_argument("--ship", action="store_true", help="copy the weights to where the plugin reads them")
     options = parser.parse_args()
     folder = options.out / "segmenters" / "osm_unet"
     folder.mkdir(parents=True, exist_ok=True)
     sources = sources_of(options.drawn, options.real, options.drawn_share, options.out)
-    net = train(sources, options.steps, folder / f"{options.name}.pt")
+    net = train(sources, folder / f"{options.name}.pt", options)
     export(net, folder / f"{options.name}.onnx")
     print(f"{folder / options.name}.onnx: {(folder / f'{options.name}.onnx').stat().st_size / 1e6:.2f} MB")
     if options.ship:

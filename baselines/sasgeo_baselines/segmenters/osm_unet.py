@@ -13,6 +13,7 @@ from scipy.special import expit
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.segmenters.features import Plane, enlarged, enlarged_mask, ground_pixel_m, has_data
+from sasgeo_baselines.segmenters.network import card_with
 
 WEIGHTS: Final = Path(__file__).with_suffix(".onnx")  # written by benchmarks/train_segmenter.py
 CLASSES: Final = (
@@ -71,6 +72,7 @@ class OsmUNet:
 
     def __init__(self, weights: Path = WEIGHTS) -> None:
         self._weights = weights
+        self.card = card_with(type(self).card, weights)
 
     def segment(self, image: sgb.AerialImage, *, learned: str | None) -> sgb.Segmentation:
         """Return probabilities at every pixel; silent on patches of pure black or white."""

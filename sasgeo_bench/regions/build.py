@@ -36,7 +36,6 @@ from sasgeo_bench.regions.imagery import ORTHO, Imagery, OffsetRecord, OrthoReco
 from sasgeo_bench.regions.layers import PaintWindow, burn, burn_mapped, make_paint, read_overview, write_layers
 from sasgeo_bench.regions.ortho import Picture, check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.region import (
-    ATTRIBUTION,
     DATA_VERSION,
     LICENCE,
     SCHEMA_VERSION,
@@ -44,9 +43,10 @@ from sasgeo_bench.regions.region import (
     ExtractRecord,
     Manifest,
     MapGraph,
+    OwnMapRecord,
     Region,
 )
-from sasgeo_bench.regions.region_spec import RegionFile
+from sasgeo_bench.regions.region_spec import OwnMap, RegionFile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +54,7 @@ class BuildPlan:
     """Inputs and outputs of a build.
 
     `source` is None for an embedded town, which is made during the build; `more` are further files of the extract.
+    `own_maps` are the files of sources beside it, in the order of the region file.
     `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date, or
     would be but for its provenance, which `region.json` alone holds, or a preview.
     `with_preview` adds a picture of the layers, which takes longer than all else of a small region.
@@ -67,6 +68,7 @@ class BuildPlan:
     inputs_sha256: str
     is_current: bool
     more: tuple[Path, ...] = ()
+    own_maps: tuple[Path, ...] = ()
     pictures: tuple[Picture, ...] = ()
     with_preview: bool = False
 
@@ -88,7 +90,7 @@ class BuildPlan:
             (
                 f"{self.spec.id}: {self.spec.title}",
                 f"  reads   {reads}, as of {self.extract.date}",
-                *(f"  reads   {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in self.more),
+                *(f"  reads   {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in (*self.more, *self.own_maps)),
                 *pictures,
                 f"  bounds  {west:.5f}, {south:.5f}, {east:.5f}, {north:.5f} (west, south, east, north)",
                 f"  grid    {grid.rows} x {grid.cols} cells of {grid.cell_size_m:g} m, EPSG:{grid.epsg}",
@@ -120,6 +122,7 @@ def plan_build(
     extract = spec.pick(date)
     source = None if extract.town else find_extract(extract, folders=extract_folders)
     more = find_parts(extract, folders=extract_folders)
+    own_maps = tuple(find_extract(one.beside(extract), folders=extract_folders) for one in spec.own_map)
     is_newest = extract == spec.pick(None)
     folder = out / "regions" / (spec.id if is_newest else f"{spec.id}@{extract.date.isoformat()}")
     inputs = _inputs_sha256(spec, extract, sha256_of(source) if source else "")
@@ -133,6 +136,7 @@ def plan_build(
         inputs_sha256=inputs,
         is_current=kept is not None and _states(kept, spec) and (_is_shown(kept) or not with_preview),
         more=more,
+        own_maps=own_maps,
         pictures=tuple(
             check_picture(find_imagery(entry, folders=imagery_folders, extracts=extract_folders), entry, grid)
             for entry in (spec.imagery if kept is None else ())
@@ -176,7 +180,7 @@ def _is_shown(manifest: Manifest) -> bool:
 
 
 def _states(manifest: Manifest, spec: RegionFile) -> bool:
-    return manifest.provenance.model_dump() == spec.provenance.model_dump()
+    return manifest.provenance.model_dump() == spec.origin.model_dump()
 
 
 def build_region(plan: BuildPlan) -> Manifest:
@@ -222,16 +226,20 @@ def _build_into(scratch: Path, plan: BuildPlan) -> Manifest:
 
 
 def _read(plan: BuildPlan, source: Path) -> Reading:
-    stated = plan.spec.stated_coverage()
-    if plan.extract.format == "geojson" and stated is not None:
-        return read_geojson(
-            (source, *plan.more),
-            plan.grid,
-            tags=plan.extract.tags,
-            stated_coverage=stated,
-            classes=plan.spec.class_names,
-        )
-    return read_extract(source, plan.grid, at=plan.extract.date, stated_coverage=stated, classes=plan.spec.classes)
+    """Read the extract, and beside it each map of one's own for the classes that it gives."""
+    spec = plan.spec
+    stated, grid = spec.stated_coverage(), plan.grid
+    if stated is not None and (plan.extract.format == "geojson" or spec.own_map):
+        of_geojson = partial(read_geojson, grid=grid, stated_coverage=stated)
+        classes = spec.extract_classes
+        if plan.extract.format == "geojson":
+            reading = of_geojson((source, *plan.more), tags=plan.extract.tags, classes=classes)
+        else:
+            reading = read_extract(source, grid, at=plan.extract.date, stated_coverage=stated, classes=classes)
+        for one, path in zip(spec.own_map, plan.own_maps, strict=True):
+            reading = reading.beside(of_geojson((path,), tags=one.tags, classes=one.classes))
+        return reading
+    return read_extract(source, grid, at=plan.extract.date, stated_coverage=stated, classes=spec.classes)
 
 
 def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading) -> OrthoRecord:
@@ -276,13 +284,13 @@ def _write_into(
     imagery: OrthoRecord | None = None,
 ) -> Manifest:
     """Burn the layers, make the graph, and write all files of a region."""
-    classes = plan.spec.class_names
+    classes, credit = plan.spec.class_names, plan.spec.origin.credit
     # GDAL packs blocks without holding the interpreter, so the layers are written while the graph is made.
     with ThreadPoolExecutor(max_workers=1) as executor:
         paint = partial(_painter, reading, plan.grid, classes)
-        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint)
+        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint, credit=credit)
         graph = build_graph(reading.features, bounds_m=plan.grid.bounds_m)
-        region_files.write_tables(scratch, reading.features, graph)
+        region_files.write_tables(scratch, reading.features, graph, credit=credit)
         manifest = make_manifest(plan, extract, reading, graph)
         layers.result()
     if plan.with_preview:
@@ -379,7 +387,7 @@ def _mend(plan: BuildPlan, kept: Manifest) -> Manifest | None:
     name, mended = plan.folder.name, kept
     if not _states(kept, plan.spec):
         tell(f"{name}: its provenance alone has changed: only {region_files.MANIFEST} is written")
-        mended = mended.model_copy(update={"provenance": plan.spec.provenance})
+        mended = mended.model_copy(update={"provenance": plan.spec.origin, "attribution": plan.spec.origin.credit})
     if plan.with_preview and not _is_shown(kept):
         tell(f"{name}: its map is up to date, and {region_files.PREVIEW} is drawn")
         _write_preview(plan.folder, mended)
@@ -463,9 +471,16 @@ def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, gra
         inputs_sha256=plan.inputs_sha256,
         files={},
         licence=LICENCE,
-        attribution=ATTRIBUTION,
-        provenance=spec.provenance,
+        attribution=spec.origin.credit,
+        provenance=spec.origin,
+        # None where features are generated, and nothing is read
+        own_maps=tuple(_own_map_record(one, path) for one, path in zip(spec.own_map, plan.own_maps, strict=False)),
     )
+
+
+def _own_map_record(own: OwnMap, path: Path) -> OwnMapRecord:
+    about = own.model_dump(include={"file", "date", "classes", "licence", "attribution", "publish", "source"})
+    return OwnMapRecord(**about, **file_record(path).model_dump())
 
 
 TILE_M: Final = 96.0

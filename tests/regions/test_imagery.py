@@ -231,6 +231,23 @@ def test_a_truncated_picture_is_refused_and_an_older_region_stays(hamlet, built,
     assert [path.name for path in (out / "regions").iterdir() if "partial" in path.name] == []
 
 
+def test_of_every_region_one_whose_picture_is_not_here_costs_no_other(hamlet, program, tmp_path):
+    files = tmp_path / "files"
+    files.mkdir()
+    text = hamlet.text()
+    (files / "hamlet.toml").write_text(text, encoding="utf-8")
+    plain = text[: text.index("[[imagery]]")].replace('id = "hamlet"', 'id = "plain"')
+    (files / "plain.toml").write_text(plain, encoding="utf-8")
+    Path(shutil.copytree(hamlet.folder, tmp_path / "extracts") / "mosaic.tif").unlink()
+    places = ("--region-files", files, "--extracts", tmp_path / "extracts", "--out", tmp_path / "out")
+    code, _, err = program("build-region", "--every", *places)
+    assert code == 2
+    (line,) = [line for line in err.splitlines() if "mosaic.tif" in line]
+    assert re.match(r"hamlet: not built: mosaic\.tif \(SHA-256 .*\) was not found: put it into ", line)
+    assert err.splitlines()[-1].endswith("not built: 1 region (hamlet) of 2; the lines above say why")
+    assert read_manifest(tmp_path / "out" / "regions" / "plain").imagery is None
+
+
 def test_imagery_must_say_whether_it_may_be_passed_on_and_is_refused_where_not(hamlet, tmp_path):
     folder = build(hamlet.but(publish=False), tmp_path)
     with pytest.raises(

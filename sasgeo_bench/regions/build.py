@@ -486,7 +486,9 @@ def _own_map_record(own: OwnMap, path: Path) -> OwnMapRecord:
 TILE_M: Final = 96.0
 REACH_M: Final = 12.0  # offsets up to this one are found
 LEAST_TILES: Final = 4
-_MOST_SPREAD_M: Final = REACH_M / 3  # of an offset that is one: peaks by chance spread over the whole reach
+# Of an offset that is one: peaks by chance spread over the whole reach
+_MOST_RESIDUAL_M: Final = 4.0
+_MOST_INTERVAL_M: Final = 2.0
 _SMOOTH_M: Final = 0.5
 _LEVEL_PERCENT: Final = 95.0
 
@@ -522,7 +524,7 @@ def measure_offset(
     -------
     OffsetRecord or None
         None with fewer than `LEAST_TILES` clear tiles; and where the median clear tile is more than 4 m from the
-        offset, or an interval is wider than that, as with peaks by chance.
+        offset, or an interval wider than 2 m, as with peaks by chance.
     """
     step_m = max(0.25, imagery.record.gsd_m)  # m: step of the correlation, or the pixel of a coarser picture
     parts = shapely.get_parts(buildings)
@@ -536,7 +538,7 @@ def measure_offset(
     drawn = np.median(peaks[rng.integers(len(peaks), size=(500, len(peaks)))], axis=1)
     tail = (100 - _LEVEL_PERCENT) / 2
     low, high = np.percentile(drawn, (tail, 100 - tail), axis=0).round(3).tolist()
-    if max(half_m, high[0] - low[0], high[1] - low[1]) > _MOST_SPREAD_M:
+    if half_m > _MOST_RESIDUAL_M or max(high[0] - low[0], high[1] - low[1]) > _MOST_INTERVAL_M:
         return None
     return OffsetRecord(
         east_m=round(float(offset[0]), 3),

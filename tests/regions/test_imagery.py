@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Aerial pictures of a place: cut, reprojected, held against the map, read window by window; bad ones are refused."""
 
+import datetime as dt
 import re
 import shutil
 from pathlib import Path
@@ -278,6 +279,17 @@ def test_a_real_mosaic_lies_on_its_map(name, most_m, tiles, tmp_path):
     assert max(abs(manifest.imagery.offset.east_m), abs(manifest.imagery.offset.north_m)) < most_m
     assert manifest.imagery.offset.tiles >= tiles
     assert manifest.imagery.is_publishable == (name == "banepa")
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_a_map_that_holds_few_of_the_houses_has_no_offset(tmp_path):
+    spec = read_region_file(list_region_files()["andorra-la-vella-ortho"])
+    try:
+        plan = plan_build(spec, out=tmp_path, date=dt.date(2017, 2, 19))
+    except (ExtractError, ImageryError) as error:
+        pytest.skip(f"real imagery: {error}")
+    assert build_region(plan).imagery.offset is None
 
 
 # Bounds: twice what separate measurements of clear patches gave, and never under 1 m east or north

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure rendering: views a second of one core, and the peak memory of the process.
+"""Measure rendering: views and crops a second of one core, and the peak memory of the process.
 
     .venv/bin/python benchmarks/rendering.py --out out
     .venv/bin/python benchmarks/rendering.py --out out --region vaduz --views 40    # a real place: SASGEO_EXTRACTS
 
 Builds the region where it is not in `--out`. One window is painted once; then views of 768 x 768 pixels are taken at
 places, headings and heights (120 to 220 m) drawn for each, with drawn conditions (haze, exposure, blur, motion, noise,
-JPEG; one season and one sun, as shadows belong to the painted scene). OpenCV runs on one thread. Seconds are of the
-processor, so that other load counts little; memory is the peak resident size with imports and region (Linux).
+JPEG; one season and one sun, as shadows belong to the painted scene). Crops are those of `drawn_crops`, with all
+ingredients and with none, and of `real_crops` where the region has imagery; opening windows counts. OpenCV runs on one
+thread. Seconds are of the processor, so that other load counts little; memory is the peak resident size with imports
+and region (Linux).
 """
 
 import argparse
 import os
 import resource
 import time
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -28,12 +32,15 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
+from sasgeo_bench.sensing.crops import Crop, drawn_crops, real_crops
 from sasgeo_bench.sensing.rendering.conditions import Conditions, draw_conditions
 from sasgeo_bench.sensing.rendering.scene import Scene, make_scene
 from sasgeo_bench.sensing.rendering.view import render
+from sasgeo_bench.sensing.rendering.wild import Ingredients
 
 SIZE_M, CELL_SIZE_M = 400.0, 0.25
 TILTS_DEG = (0.0, 20.0, 45.0)
+WARM_UP = 40
 
 
 def main() -> None:
@@ -42,6 +49,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--region", default="town-riverside")
     parser.add_argument("--views", type=int, default=24)
+    parser.add_argument("--crops", type=int, default=400)
     parser.add_argument("--extracts", type=Path, default=Path(os.environ.get("SASGEO_EXTRACTS", ".")))
     said = parser.parse_args()
     cv2.setNumThreads(1)
@@ -60,7 +68,19 @@ def main() -> None:
         seconds = [_seconds(scene, middle, tilt_deg, number) for number in range(said.views)]
         median, slow = np.median(seconds), np.quantile(seconds, 0.9)
         print(f"tilt {tilt_deg:2g} deg: {1 / median:5.1f} views a CPU second (median; slowest tenth {1 / slow:.1f})")
+    _measure_crops("drawn crops", drawn_crops([region], seed=1), said.crops)
+    _measure_crops("without ingredients", drawn_crops([region], seed=1, ingredients=Ingredients.none()), said.crops)
+    if region.imagery is not None:
+        _measure_crops("real crops", real_crops([region], seed=1), said.crops)
     print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6:.0f} MB")
+
+
+def _measure_crops(title: str, crops: Iterator[Crop], count: int) -> None:
+    """Take crops of 256 x 256 pixels after as many as open the first windows; print how many a second."""
+    next(islice(crops, WARM_UP, WARM_UP), None)
+    start = time.process_time()
+    sides = {crop.rgb.shape[0] for crop in islice(crops, count)}
+    print(f"{title}, {max(sides)} px: {count / (time.process_time() - start):5.1f} a CPU second")
 
 
 def _region(name: str, out: Path, extracts: Path | None) -> Region:

@@ -121,6 +121,9 @@ from .sensing.camera import Attitude as Attitude
 from .sensing.camera import Camera as Camera
 from .sensing.camera import Intrinsics as Intrinsics
 from .sensing.camera import Mount as Mount
+from .sensing.crops import Crop as Crop
+from .sensing.crops import drawn_crops as drawn_crops
+from .sensing.crops import real_crops as real_crops
 from .sensing.ground import Dem as Dem
 from .sensing.ground import Plane as Plane
 from .sensing.ground import read_dem as read_dem
@@ -136,6 +139,7 @@ from .sensing.rendering.scene import make_scene as make_scene
 from .sensing.rendering.view import labels as labels
 from .sensing.rendering.view import render as render
 from .sensing.rendering.view import render_labelled as render_labelled
+from .sensing.rendering.wild import Ingredients as Ingredients
 from .sensing.segmentation import Segmentation as Segmentation
 from .sensing.tiny_images import tiny_images as tiny_images
 from .sensing.tiny_images import with_picture as with_picture

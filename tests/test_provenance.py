@@ -16,7 +16,7 @@ from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.exchange.release_files import ReleaseMap, map_record
 from sasgeo_bench.regions.build import build_region, plan_build
-from sasgeo_bench.regions.region import Provenance
+from sasgeo_bench.regions.region import ATTRIBUTION, Provenance
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file
 from tests.world import answered, drawn, scored
@@ -72,6 +72,13 @@ def test_every_line_reaches_every_file_and_every_table(tmp_path, lay_towns, few_
     page, method = (
         (request.board / "site" / f"{name}.html").read_text(encoding="utf-8") for name in ("regions", "method")
     )
+    credit = Provenance(**STATED).credit
+    assert credit == f"{ATTRIBUTION}; {STATED['further_sources']}"
+    for about in (task / "task.json", request.board / "board.json", tmp_path / "results" / "pack.json"):
+        assert read(about)["attribution"] == credit, about
+    for name in ("leaderboard.md", "leaderboard.tex", "site/index.html", "site/method.html"):
+        text = (request.board / name).read_text(encoding="utf-8").replace("\\_", "_")
+        assert STATED["further_sources"] in text, name
     record = map_record(ReleaseMap(folder=region, manifest=read_manifest(region)))
     for title, text in Provenance(**STATED).titled().items():
         assert title in page

@@ -8,7 +8,7 @@ With --scenes it measures the scenes of every real region instead, and writes th
 import argparse
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations_with_replacement
@@ -45,9 +45,9 @@ Every real place that ships, by part of the split [`{SPLIT}`](../splits/README.m
 *Built*: mapped ground in steps of {STEP_M:.0f} m with a building. *Drawn*: mapped ground under any class. *Views*: of
 192 m, drawn by the suite `clean`, none of which overlaps another of its region; a place counts with two. A few regions
 of one city share up to 1 km2, Runavik and Toftir 2 km2: they are one place, so that no draw of places counts that
-ground as two. *Sealed* places are asked by a seed that is given at run time. *Maps*: the dates of all regions of a
-place. `python docs/figures/places.py --out out` writes this page and the sheet anew, of what `build-region --every`
-built.
+ground as two; ground of a place that is a region again under a picture (`-ortho`) counts once. *Sealed* places are
+asked by a seed that is given at run time. *Maps*: the dates of all regions of a place. `python docs/figures/places.py
+--out out` writes this page and the sheet anew, of what `build-region --every` built.
 
 ![A small map of every region, by place](figures/places.webp)
 
@@ -168,10 +168,16 @@ def write(sheet: NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
     cv2.putText(sheet, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.33, (40, 40, 40), 1, cv2.LINE_AA)
 
 
+def own_ground(regions: Sequence[str]) -> list[str]:
+    """Return the regions of a place without those that are ground of another under a picture; at least one."""
+    files = list_region_files()
+    return [one for one in regions if not read_region_file(files[one]).imagery] or [regions[0]]
+
+
 def rows_and_maps(out: Path) -> Iterator[tuple[str, list[Measured]]]:
     """Yield the row and the regions of each place of the split."""
     for place in split().spec.place:
-        regions = [measured(region, out) for region in place.region_ids]
+        regions = [measured(region, out) for region in own_ground(place.region_ids)]
         yield row_of(place, regions), regions
 
 
@@ -187,7 +193,7 @@ def scenes_table() -> str:
     counts = Counter(
         (scene, place.part)
         for place in split().spec.place
-        for region in place.region_ids
+        for region in own_ground(place.region_ids)
         for scene in read_region_file(files[region]).scenes
     )
     rows = [[scene, *(str(counts[scene, part]) for part in parts)] for scene in get_args(Scene)]

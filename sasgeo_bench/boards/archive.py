@@ -29,7 +29,7 @@ from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import METRICS, check_registered, code_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.regions.region import LICENCE
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import Task
@@ -71,7 +71,7 @@ def pack_board(scored: Scored, request: ScoreRequest, folder: Path, *, most_byte
         board=request.board,
         tasks=tasks,
         runs=runs,
-        settings=_settings_of(request, list(runs)),
+        settings=_settings_of(request, list(runs), credit=scored.board.about.credit),
         most_bytes=most_bytes,
     )
     return Stored(folder=folder, packed=packed)
@@ -89,7 +89,7 @@ def _runs_of(entry: Entry, scored: Scored, ids: Mapping[tuple[str, str], Sequenc
         )
 
 
-def _settings_of(request: ScoreRequest, contestants: Sequence[str]) -> PackManifest:
+def _settings_of(request: ScoreRequest, contestants: Sequence[str], *, credit: str) -> PackManifest:
     return PackManifest(
         schema_version=SCHEMA_VERSION,
         split=None if request.split is None else request.split.spec.id,
@@ -102,7 +102,7 @@ def _settings_of(request: ScoreRequest, contestants: Sequence[str]) -> PackManif
         contestants=list(contestants),
         dropped="",
         licence=LICENCE,
-        attribution=ATTRIBUTION,
+        attribution=credit,
         files=None,
     )
 

@@ -25,7 +25,7 @@ from sasgeo_bench.core.json import MOST_BYTES
 from sasgeo_bench.core.parquet import read_frame, read_schema, write_frame
 from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.texts import csv_cell, json_text, one_line
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.regions.region import LICENCE
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, FALSIFIER_SCHEMA
 from sasgeo_bench.scoring.flights import SCORE_SCHEMA
@@ -88,7 +88,7 @@ def write_board(
     unchanged.
     """
     versions = {name: str(getattr(about, name)) for name in _VERSIONS if getattr(about, name) is not None}
-    metadata = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
+    metadata = {"attribution": about.credit, "licence": LICENCE, **versions}
     try:
         with locked(folder):
             check_board(folder, scorer_version=about.scorer_version)
@@ -101,7 +101,7 @@ def write_board(
                 content = {
                     **whole.model_dump(mode="json", exclude_unset=True),
                     "licence": LICENCE,
-                    "attribution": ATTRIBUTION,
+                    "attribution": about.credit,
                 }
                 (scratch / BOARD).write_text(json_text(content), encoding="utf-8")
     except SasgeoError:

@@ -37,7 +37,7 @@ from sasgeo_bench.core.texts import json_text, one_line
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.preview import paint_overview
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
+from sasgeo_bench.regions.region import LICENCE, Manifest
 from sasgeo_bench.running.failures import Failures, is_disk_error
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Floats
@@ -138,7 +138,7 @@ def pictures_extra(
     if not found.files:
         return AdditionalFiles(tables=answers)
     kinds = {kind: [item.model_dump(mode="json") for item in items] for kind, items in found.listed.items()}
-    content = json_text({**kinds, "licence": LICENCE, "attribution": ATTRIBUTION})
+    content = json_text({**kinds, "licence": LICENCE, "attribution": scored.board.about.credit})
     return AdditionalFiles(tables=answers, pictures={**found.files, PICTURES_FILE: content.encode()})
 
 
@@ -203,7 +203,8 @@ def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], scored: Sc
 def _example(task: Task) -> bytes:
     shown = panels_of(task, choose=control_and_stress)
     title = f"{task.manifest.title}: {task.manifest.region}"
-    return fitted(pixels_of(sheet_figure(title, shown, dpi=_SHEET_DPI)), SUITE_BYTES)
+    sheet = sheet_figure(title, shown, dpi=_SHEET_DPI, credit=task.manifest.provenance.credit)
+    return fitted(pixels_of(sheet), SUITE_BYTES)
 
 
 def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:

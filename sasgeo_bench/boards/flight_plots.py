@@ -33,7 +33,6 @@ from sasgeo_bench.core.canvas import Page, page, panels
 from sasgeo_bench.core.errors import StoreError, counted
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.flights import DRIFT_M, RECKONED_M
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import CONTROL, DRIFT, GROUP, primary_rows
@@ -87,7 +86,7 @@ def flight_map_pixels(task: Task, flight: str, views: Mapping[str, pd.DataFrame]
         title=f"{about.title}: {about.region}",
         facts=f"One flight, {truth.role}: {truth.kind}. {about.what}",
         note="North is up." + (" Trackers differ most on this flight of the suite." if len(names) > 1 else ""),
-        data=ATTRIBUTION,
+        data=about.provenance.credit,
         rows=-(-len(names) // across),
         columns=across,
         panel_inches=(_ONE_INCHES, _ONE_INCHES) if len(names) == 1 else (_INCHES, _INCHES),

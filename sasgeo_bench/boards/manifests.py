@@ -10,7 +10,7 @@ from sasgeo_bench.core.config import Record
 from sasgeo_bench.core.json import parse_json
 from sasgeo_bench.core.texts import FOLDER, one_line
 from sasgeo_bench.matching.cards import Learned
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Provenance
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Provenance, credit_of
 from sasgeo_bench.running.prediction_files import CardRecord
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast
@@ -258,6 +258,16 @@ class BoardManifest(Record):
     failed: dict[str, str] = {}
     licence: str | None = None
     attribution: str | None = None
+
+    @property
+    def further_sources(self) -> tuple[str, ...]:
+        """Return the sources of its maps beside OpenStreetMap, each once."""
+        return tuple(dict.fromkeys(filter(None, (task.provenance.further_sources for task in self.tasks))))
+
+    @property
+    def credit(self) -> str:
+        """Return whom to name beside what is made of its maps."""
+        return credit_of(task.provenance for task in self.tasks)
 
 
 class Picture(Record):

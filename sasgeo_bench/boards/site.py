@@ -117,6 +117,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         site=site,
         source=source,
         about=board.about,
+        further_sources=board.about.further_sources,
         book=site.book,
         there={page.file: page.name for page in there},
         note=NOTE.format(draws=board.about.draws or "?"),

@@ -34,7 +34,7 @@ from sasgeo_bench.core.folders import IMAGES, SITE_FOLDERS, check_site, fresh_fo
 from sasgeo_bench.core.folders import SITE_MANIFEST as MANIFEST
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import json_text, one_line
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.regions.region import LICENCE
 from sasgeo_bench.scoring.contrasts import Contrast
 
 MAPS: Final = "maps"
@@ -391,7 +391,7 @@ def write_site(
         "board": name,
         "made_by": files.board.about.made_by,
         "licence": LICENCE,
-        "attribution": ATTRIBUTION,
+        "attribution": files.board.about.credit,
         "files": sorted({*written, *pictures}),
     }
     written[MANIFEST] = json_text(content).encode()

@@ -319,6 +319,7 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
         *metric_lines(about),
         *(f"Failed, and not on this board: {name}: {why}" for name, why in about.failed.items()),
     ]
+    made_by = markdown(about.made_by or "?")
     columns = {column.term: column.meaning for table in tables for column in table.columns}
     ours = set(MEANINGS.values())  # which may hold code
     escaped = {term: meaning if meaning in ours else markdown(meaning) for term, meaning in columns.items()}
@@ -326,7 +327,7 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
         (
             f"# Board: scorer version {about.scorer_version}, task version {about.task_version}",
             "",
-            f"Made by {markdown(about.made_by or '?')}. Split: {markdown(about.split or 'none')}. Data: {ATTRIBUTION}.",
+            f"Made by {made_by}. Split: {markdown(about.split or 'none')}. Data: {markdown(about.credit)}.",
             "",
             f"{NOTE.format(draws=about.draws)} {RANKS_NOTE}",
             "",
@@ -380,16 +381,21 @@ _HEAD: Final = (
 
 def board_latex(about: BoardManifest, of: Contents) -> str:
     """Return the tables of a board for a paper, which needs the package booktabs."""
-    head = f"% {tex(about.made_by or '?')}, scorer version {about.scorer_version}; {ATTRIBUTION}"
-    return "\n".join((head, *_HEAD, *(line for table in rows_of(of, LATEX) for line in table_latex(table)))) + "\n"
+    head = f"% {tex(about.made_by or '?')}, scorer version {about.scorer_version}; {tex(about.credit)}"
+    return (
+        "\n".join(
+            (head, *_HEAD, *(line for table in rows_of(of, LATEX) for line in table_latex(table, credit=about.credit)))
+        )
+        + "\n"
+    )
 
 
-def table_latex(table: Table) -> Iterator[str]:
+def table_latex(table: Table, *, credit: str = ATTRIBUTION) -> Iterator[str]:
     """Yield the lines of a table; its label is its name."""
     rows = [" & ".join(tex(text_of(cell)) for cell in row.cells) + r" \\" for row in table.rows]
     dagger = f" {tex(DAGGER)} Wilson's interval over sites." if any(tex(DAGGER) in row for row in rows) else ""
     yield r"\begin{table}"
-    yield rf"\caption{{{tex(table.title)}.{dagger} Data: {tex(ATTRIBUTION)}.}}"
+    yield rf"\caption{{{tex(table.title)}.{dagger} Data: {tex(credit)}.}}"
     yield rf"\label{{tab:{table.name}}}"
     yield rf"\begin{{tabular}}{{{'l' * len(table.columns)}}}"
     yield r"\toprule"

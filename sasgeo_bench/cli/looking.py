@@ -135,7 +135,7 @@ def _inspect_task(task: Task, out: Path, *, query: str | None, rows: int) -> Non
     if maps:
         write_flight_sheet(path, task, maps)
     else:
-        write_sheet(path, title=f"{about.title}: {about.region}", panels=chosen)
+        write_sheet(path, title=f"{about.title}: {about.region}", panels=chosen, credit=about.provenance.credit)
     say(f"contact sheet: {path}")
 
 

@@ -27,7 +27,7 @@ from sasgeo_bench.core.parquet import open_table, read_table, table_writer
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import json_text
 from sasgeo_bench.regions.imagery import ORTHO
-from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
+from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest, credit_of
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, base_of
@@ -44,15 +44,16 @@ COPYRIGHT_URL: Final = "https://www.openstreetmap.org/copyright"
 SCHEMA_VERSION: Final = 1
 TRUTHS: Final = "truth"  # configuration and record set of a suite's truths: its name, a dash, and this
 
-_NOTICE: Final = f"""\
-{ATTRIBUTION}
+_NOTICE: Final = """\
+{credit}
 
 The data of this release is made available under the Open Database License 1.0 (ODbL-1.0).
-Licence text: {LICENCE_URL}
-Source and its copyright: {COPYRIGHT_URL}
+Licence text: {licence_url}
+Source and its copyright: {copyright_url}
 
 Whoever passes the data on, changed or not, keeps this notice, names OpenStreetMap and its contributors where a
-reader sees it, and offers what is derived from the data under the ODbL as well. A picture or a score made from
+reader sees it, and offers what is derived from the data under the ODbL as well. Further sources that stand above
+have the licence that is named with them. A picture or a score made from
 the data may have another licence and carries the attribution.
 """
 
@@ -172,6 +173,11 @@ class Release:
     def version(self) -> str:
         """Return the versions of data and tasks, as in 1.1.0; regions do not count."""
         return f"{DATA_VERSION}.{TASK_VERSION}.0"
+
+    @property
+    def credit(self) -> str:
+        """Return whom to name beside the data: OpenStreetMap, and further sources of maps."""
+        return credit_of(item.manifest.provenance for item in self.maps)
 
     @property
     def truths_text(self) -> str:
@@ -331,7 +337,11 @@ def _copy_truths(folder: Path, task: ReleaseTask) -> None:
         plain = (_plain(batch.filter(pc.is_in(batch["query_id"], ids))) for batch in rows)
         _write_batches(folder / task.file_of(part, kind="truth"), PLAIN_TRUTH_SCHEMA, plain)
     if task.is_whole:  # neither the seed nor the hash of the request, which would tell it
-        _write_json(target / task_files.TRUTH_OF, {"queries_sha256": task.source.manifest.queries_sha256})
+        _write_json(
+            target / task_files.TRUTH_OF,
+            {"queries_sha256": task.source.manifest.queries_sha256},
+            credit=task.source.manifest.provenance.credit,
+        )
 
 
 def _plain(batch: pa.RecordBatch) -> pa.RecordBatch:
@@ -347,8 +357,8 @@ def _write_batches(path: Path, schema: pa.Schema, batches: Iterator[pa.RecordBat
                 target.write_batch(batch.select(schema.names).cast(schema))
 
 
-def _write_json(path: Path, content: Mapping[str, object]) -> None:
-    path.write_text(json_text({**content, "licence": LICENCE, "attribution": ATTRIBUTION}), encoding="utf-8")
+def _write_json(path: Path, content: Mapping[str, object], *, credit: str) -> None:
+    path.write_text(json_text({**content, "licence": LICENCE, "attribution": credit}), encoding="utf-8")
 
 
 def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:
@@ -371,7 +381,8 @@ def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:
 
 def write_texts(folder: Path, release: Release, texts: Mapping[str, str]) -> None:
     """Write the licence notice, the note on imagery, and further texts by their paths."""
-    for name, text in {NOTICE: _NOTICE, IMAGERY: imagery_text(release.maps), **texts}.items():
+    notice = _NOTICE.format(credit=release.credit, licence_url=LICENCE_URL, copyright_url=COPYRIGHT_URL)
+    for name, text in {NOTICE: notice, IMAGERY: imagery_text(release.maps), **texts}.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
 
@@ -407,7 +418,7 @@ def write_index(folder: Path, release: Release) -> None:
         "truths": release.truths_text,
         "licence_url": LICENCE_URL,
     }
-    _write_json(folder / INDEX, content)
+    _write_json(folder / INDEX, content, credit=release.credit)
 
 
 def places_of(release: Release) -> list[Place]:

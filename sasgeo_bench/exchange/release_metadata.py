@@ -29,7 +29,7 @@ from sasgeo_bench.geometry.projection import to_lonlat
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.layers import OUTSIDE
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, MADE_UP
+from sasgeo_bench.regions.region import LICENCE, MADE_UP
 from sasgeo_bench.tasks.task_files import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def write_zenodo(folder: Path, release: Release) -> None:
         "access_right": "open",
         "language": "eng",
         "keywords": _KEYWORDS,
-        "notes": ATTRIBUTION,
+        "notes": release.credit,
     }
     related = [{"identifier": release.url, "relation": "isIdenticalTo"}] if release.url else []
     text = json_text(content | ({"related_identifiers": related} if related else {}))
@@ -193,7 +193,7 @@ def write_zenodo(folder: Path, release: Release) -> None:
 def _description(release: Release) -> str:
     return (
         f"Semantic maps of {len(release.regions)} regions and {release.queries} queries for map localization of "
-        f"UAVs without GNSS, made from dated OpenStreetMap extracts. {ATTRIBUTION}"
+        f"UAVs without GNSS, made from dated OpenStreetMap extracts. {release.credit}"
     )
 
 
@@ -203,7 +203,7 @@ def cite_as(release: Release) -> str:
     return (
         f"@misc{{sasgeo_bench_{year}, title = {{sasgeo-bench, dataset release {release.version}}}, "
         f"author = {{{{{AUTHORS}}}}}, year = {{{year}}}, "
-        f"note = {{Data {ATTRIBUTION}}}}}"
+        f"note = {{Data {release.credit}}}}}"
     )
 
 
@@ -364,8 +364,8 @@ def write_stac(folder: Path, release: Release) -> None:
     catalog = pystac.Catalog(
         id="sasgeo-bench",
         title="sasgeo-bench",
-        description=f"Maps of the dataset release {release.version} of sasgeo-bench. {ATTRIBUTION}",
-        extra_fields={"attribution": ATTRIBUTION},
+        description=f"Maps of the dataset release {release.version} of sasgeo-bench. {release.credit}",
+        extra_fields={"attribution": release.credit},
     )
     catalog.add_link(_licence_link())
     catalog.add_child(collection)
@@ -388,13 +388,13 @@ def _collection(items: list["pystac.Item"], release: Release) -> "pystac.Collect
         title="Semantic maps of regions",
         description=(
             "Semantic layers, classified geometry and map graphs of geographic regions, each made from one dated "
-            f"OpenStreetMap extract. {ATTRIBUTION}"
+            f"OpenStreetMap extract. {release.credit}"
         ),
         extent=pystac.Extent.from_items(items),
         license=LICENCE,
         keywords=["OpenStreetMap", "map localization", "UAV", "semantic map"],
         providers=_providers(release),
-        extra_fields={"attribution": ATTRIBUTION, "version": release.version},
+        extra_fields={"attribution": release.credit, "version": release.version},
     )
     collection.add_link(_licence_link())
     return collection
@@ -510,7 +510,7 @@ def _head(release: Release) -> Iterator[str]:
     size = next((name for most, name in _SIZES if release.queries < most), "n>1M")
     yield "license: odbl"
     yield "pretty_name: sasgeo-bench"
-    yield f"attribution: {quoted(ATTRIBUTION)}"
+    yield f"attribution: {quoted(release.credit)}"
     yield "tags: [geospatial, OpenStreetMap, UAV, map-localization]"
     yield f"size_categories: [{quoted(size)}]"
     yield "configs:"
@@ -542,8 +542,8 @@ Semantic maps of {regions} and {counted(release.queries, "query", "queries")} fo
 GNSS: each query is a view of a place by a detector that makes errors, and asks where on a map it was taken.
 Everything is made from dated OpenStreetMap extracts by {release.made_by}; published {release.published}.
 
-**{ATTRIBUTION}.** The data is under the Open Database License 1.0 ([notice](LICENSE-ODbL.txt), [text]({LICENCE_URL}),
-[source]({COPYRIGHT_URL})).
+**{release.credit}.** The data is under the Open Database License 1.0 ([notice](LICENSE-ODbL.txt),
+[text]({LICENCE_URL}), [source]({COPYRIGHT_URL})).
 
 | In this release | What |
 |---|---|
@@ -712,7 +712,7 @@ def _ending(release: Release) -> str:
     return f"""\
 ## Licence and citation
 
-{ATTRIBUTION}. Name OpenStreetMap and its contributors where a reader sees it, and offer what is derived from this
+{release.credit}. Name OpenStreetMap and its contributors where a reader sees it, and offer what is derived from this
 data under the ODbL as well ([LICENSE-ODbL.txt](LICENSE-ODbL.txt)). Maps whose name begins with `town-` are made up by
 a program; the notice stands on them too.
 
@@ -730,7 +730,7 @@ def datasheet_text(release: Release) -> str:
     opening = f"""\
 # Datasheet of sasgeo-bench, dataset release {release.version}
 
-After Gebru et al., *Datasheets for Datasets*, Communications of the ACM 64(12), 2021. {ATTRIBUTION}."""
+After Gebru et al., *Datasheets for Datasets*, Communications of the ACM 64(12), 2021. {release.credit}."""
     parts = (
         opening,
         _motivation(release),
@@ -901,7 +901,7 @@ def _distribution(release: Release) -> str:
 **How is it distributed?** As a folder of files: cloud-optimized GeoTIFF, GeoParquet 1.1 and Parquet, with a STAC
 catalog, Croissant metadata and a card that the `datasets` library reads.
 
-**Under which licence?** Open Database License 1.0, {LICENCE_URL}. {ATTRIBUTION}. Every file says so in its own
+**Under which licence?** Open Database License 1.0, {LICENCE_URL}. {release.credit}. Every file says so in its own
 metadata or text.
 
 **Is there anything else in it?** {more}"""

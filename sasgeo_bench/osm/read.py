@@ -2,6 +2,7 @@
 """Read an OSM file into a feature table: read, classify, project, cut to the grid."""
 
 import datetime as dt
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -169,6 +170,22 @@ class Reading:
     warnings: tuple[str, ...]
     unknown_m2: dict[str, float] = field(default_factory=dict)
     cuts: dict[str, int] = field(default_factory=dict)
+
+    def beside(self, other: Self) -> Self:
+        """Return the content of two sources that share no class; mapped is the ground that both have."""
+        taxonomy, table = load_taxonomy(), pd.concat([self.features, other.features])
+        order = np.argsort([taxonomy.names.index(name) for name in table["class"]], kind="stable")
+        return replace(
+            self,
+            features=check_features(table.iloc[order].reset_index(drop=True)),
+            coverage=shapely.intersection(self.coverage, other.coverage),
+            warnings=self.warnings + other.warnings,
+            drops=dict(Counter(self.drops) + Counter(other.drops)),
+            hidden=dict(Counter(self.hidden) + Counter(other.hidden)),
+            notes=dict(Counter(self.notes) + Counter(other.notes)),
+            unknown_m2=self.unknown_m2 | other.unknown_m2,
+            cuts=dict(Counter(self.cuts) + Counter(other.cuts)),
+        )
 
     def dated(self, snapshot: Snapshot) -> Self:
         """Return the content with the date and the warnings of the file that it was read from."""

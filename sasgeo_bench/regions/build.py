@@ -36,7 +36,6 @@ from sasgeo_bench.regions.imagery import ORTHO, Imagery, OffsetRecord, OrthoReco
 from sasgeo_bench.regions.layers import PaintWindow, burn, burn_mapped, make_paint, read_overview, write_layers
 from sasgeo_bench.regions.ortho import Picture, check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.region import (
-    ATTRIBUTION,
     DATA_VERSION,
     LICENCE,
     SCHEMA_VERSION,
@@ -44,9 +43,10 @@ from sasgeo_bench.regions.region import (
     ExtractRecord,
     Manifest,
     MapGraph,
+    OwnMapRecord,
     Region,
 )
-from sasgeo_bench.regions.region_spec import RegionFile
+from sasgeo_bench.regions.region_spec import OwnMap, RegionFile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +54,7 @@ class BuildPlan:
     """Inputs and outputs of a build.
 
     `source` is None for an embedded town, which is made during the build; `more` are further files of the extract.
+    `own_maps` are the files of sources beside it, in the order of the region file.
     `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date, or
     would be but for its provenance, which `region.json` alone holds, or a preview.
     `with_preview` adds a picture of the layers, which takes longer than all else of a small region.
@@ -67,6 +68,7 @@ class BuildPlan:
     inputs_sha256: str
     is_current: bool
     more: tuple[Path, ...] = ()
+    own_maps: tuple[Path, ...] = ()
     pictures: tuple[Picture, ...] = ()
     with_preview: bool = False
 
@@ -88,7 +90,7 @@ class BuildPlan:
             (
                 f"{self.spec.id}: {self.spec.title}",
                 f"  reads   {reads}, as of {self.extract.date}",
-                *(f"  reads   {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in self.more),
+                *(f"  reads   {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in (*self.more, *self.own_maps)),
                 *pictures,
                 f"  bounds  {west:.5f}, {south:.5f}, {east:.5f}, {north:.5f} (west, south, east, north)",
                 f"  grid    {grid.rows} x {grid.cols} cells of {grid.cell_size_m:g} m, EPSG:{grid.epsg}",
@@ -120,6 +122,7 @@ def plan_build(
     extract = spec.pick(date)
     source = None if extract.town else find_extract(extract, folders=extract_folders)
     more = find_parts(extract, folders=extract_folders)
+    own_maps = tuple(find_extract(one.beside(extract), folders=extract_folders) for one in spec.own_map)
     is_newest = extract == spec.pick(None)
     folder = out / "regions" / (spec.id if is_newest else f"{spec.id}@{extract.date.isoformat()}")
     inputs = _inputs_sha256(spec, extract, sha256_of(source) if source else "")
@@ -133,6 +136,7 @@ def plan_build(
         inputs_sha256=inputs,
         is_current=kept is not None and _states(kept, spec) and (_is_shown(kept) or not with_preview),
         more=more,
+        own_maps=own_maps,
         pictures=tuple(
             check_picture(find_imagery(entry, folders=imagery_folders, extracts=extract_folders), entry, grid)
             for entry in (spec.imagery if kept is None else ())
@@ -176,7 +180,7 @@ def _is_shown(manifest: Manifest) -> bool:
 
 
 def _states(manifest: Manifest, spec: RegionFile) -> bool:
-    return manifest.provenance.model_dump() == spec.provenance.model_dump()
+    return manifest.provenance.model_dump() == spec.origin.model_dump()
 
 
 def build_region(plan: BuildPlan) -> Manifest:
@@ -222,16 +226,20 @@ def _build_into(scratch: Path, plan: BuildPlan) -> Manifest:
 
 
 def _read(plan: BuildPlan, source: Path) -> Reading:
-    stated = plan.spec.stated_coverage()
-    if plan.extract.format == "geojson" and stated is not None:
-        return read_geojson(
-            (source, *plan.more),
-            plan.grid,
-            tags=plan.extract.tags,
-            stated_coverage=stated,
-            classes=plan.spec.class_names,
-        )
-    return read_extract(source, plan.grid, at=plan.extract.date, stated_coverage=stated, classes=plan.spec.classes)
+    """Read the extract, and beside it each map of one's own for the classes that it gives."""
+    spec = plan.spec
+    stated, grid = spec.stated_coverage(), plan.grid
+    if stated is not None and (plan.extract.format == "geojson" or spec.own_map):
+        of_geojson = partial(read_geojson, grid=grid, stated_coverage=stated)
+        classes = spec.extract_classes
+        if plan.extract.format == "geojson":
+            reading = of_geojson((source, *plan.more), tags=plan.extract.tags, classes=classes)
+        else:
+            reading = read_extract(source, grid, at=plan.extract.date, stated_coverage=stated, classes=classes)
+        for one, path in zip(spec.own_map, plan.own_maps, strict=True):
+            reading = reading.beside(of_geojson((path,), tags=one.tags, classes=one.classes))
+        return reading
+    return read_extract(source, grid, at=plan.extract.date, stated_coverage=stated, classes=spec.classes)
 
 
 def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading) -> OrthoRecord:
@@ -247,7 +255,7 @@ def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading) -> OrthoRec
     imagery = Imagery(path=path, file=file_record(path), record=record, epsg=grid.epsg)
     houses = reading.features[((reading.features["class"] == "building") & reading.features["is_visible"]).to_numpy()]
     # 0: seed of the tiles drawn anew for an interval: the same pictures give the same bytes
-    offset = measure_offset(imagery, houses.geometry.to_numpy(), reading.coverage, rng=np.random.default_rng(0))
+    offset = measure_offset(imagery, houses.geometry.to_numpy(), rng=np.random.default_rng(0))
     share = share_shown(imagery, reading.coverage, plan.grid.cell_size_m)
     shown = f"{name}: imagery shows {share:.1%} of the mapped ground"
     tell(f"{shown}, off the map by {offset.to_text()}" if offset else f"{shown}; its offset could not be measured")
@@ -276,13 +284,13 @@ def _write_into(
     imagery: OrthoRecord | None = None,
 ) -> Manifest:
     """Burn the layers, make the graph, and write all files of a region."""
-    classes = plan.spec.class_names
+    classes, credit = plan.spec.class_names, plan.spec.origin.credit
     # GDAL packs blocks without holding the interpreter, so the layers are written while the graph is made.
     with ThreadPoolExecutor(max_workers=1) as executor:
         paint = partial(_painter, reading, plan.grid, classes)
-        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint)
+        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint, credit=credit)
         graph = build_graph(reading.features, bounds_m=plan.grid.bounds_m)
-        region_files.write_tables(scratch, reading.features, graph)
+        region_files.write_tables(scratch, reading.features, graph, credit=credit)
         manifest = make_manifest(plan, extract, reading, graph)
         layers.result()
     if plan.with_preview:
@@ -379,7 +387,7 @@ def _mend(plan: BuildPlan, kept: Manifest) -> Manifest | None:
     name, mended = plan.folder.name, kept
     if not _states(kept, plan.spec):
         tell(f"{name}: its provenance alone has changed: only {region_files.MANIFEST} is written")
-        mended = mended.model_copy(update={"provenance": plan.spec.provenance})
+        mended = mended.model_copy(update={"provenance": plan.spec.origin, "attribution": plan.spec.origin.credit})
     if plan.with_preview and not _is_shown(kept):
         tell(f"{name}: its map is up to date, and {region_files.PREVIEW} is drawn")
         _write_preview(plan.folder, mended)
@@ -463,14 +471,24 @@ def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, gra
         inputs_sha256=plan.inputs_sha256,
         files={},
         licence=LICENCE,
-        attribution=ATTRIBUTION,
-        provenance=spec.provenance,
+        attribution=spec.origin.credit,
+        provenance=spec.origin,
+        # None where features are generated, and nothing is read
+        own_maps=tuple(_own_map_record(one, path) for one, path in zip(spec.own_map, plan.own_maps, strict=False)),
     )
 
 
-TILE_M: Final = 64.0
-REACH_M: Final = 6.0  # offsets up to this one are found
+def _own_map_record(own: OwnMap, path: Path) -> OwnMapRecord:
+    about = own.model_dump(include={"file", "date", "classes", "licence", "attribution", "publish", "source"})
+    return OwnMapRecord(**about, **file_record(path).model_dump())
+
+
+TILE_M: Final = 96.0
+REACH_M: Final = 12.0  # offsets up to this one are found
 LEAST_TILES: Final = 4
+# Of an offset that is one: peaks by chance spread over the whole reach
+_MOST_RESIDUAL_M: Final = 4.0
+_MOST_INTERVAL_M: Final = 2.0
 _SMOOTH_M: Final = 0.5
 _LEVEL_PERCENT: Final = 95.0
 
@@ -479,65 +497,76 @@ Surface = NDArray[np.float64]
 
 
 def measure_offset(
-    imagery: Imagery, buildings: NDArray[np.object_], mapped: shapely.Geometry, *, rng: np.random.Generator
+    imagery: Imagery, buildings: NDArray[np.object_], *, rng: np.random.Generator
 ) -> OffsetRecord | None:
     """Return the offset of imagery against building outlines, or None where edges are too few or do not agree.
 
-    `buildings` are polygons in the region's CRS, `mapped` the ground where all buildings are mapped. A wall counts by
-    its direction, so that it agrees with an edge along it, dark to bright or bright to dark, and edges of crowns in all
-    directions cancel. Each tile of 64 m gives a surface of correlation over offsets of up to 6 m; their sum is highest
-    at the offset. Intervals come from tiles drawn anew with replacement.
+    A wall counts by its direction, so that it agrees with an edge along it, dark to bright or bright to dark, and edges
+    of crowns in all directions cancel. Each tile of 96 m gives a surface of correlation over offsets of up to 12 m,
+    and counts if its peak is clear: one standard deviation above any other. The offset is the median of clear tiles:
+    neither tiles on a slope, nor those where the ridges of a row of houses lie on its walls, move it far. Intervals
+    come from tiles drawn anew with replacement.
 
-    Roofs lean away from the middle of a photo: in a mosaic that is not a true orthophoto the offset is that of roofs.
+    It is the offset of the edges of roofs against mapped outlines. Maps have walls at the ground, or roofs of another
+    picture; and in a mosaic that is no true orthophoto a roof leans away from the middle of its photo, by its height
+    times the tangent of the view's tilt. So the ground, roads among it, may lie otherwise by a metre or two.
+
+    Parameters
+    ----------
+    imagery : Imagery
+        Read tile by tile, at 0.25 m or its own pixels if they are coarser.
+    buildings : ndarray of object
+        Polygons in the region's CRS. Buildings that the map lacks add noise alone.
+    rng : numpy.random.Generator
+        Of the tiles drawn anew.
+
+    Returns
+    -------
+    OffsetRecord or None
+        None with fewer than `LEAST_TILES` clear tiles; and where the median clear tile is more than 4 m from the
+        offset, or an interval wider than 2 m, as with peaks by chance.
     """
     step_m = max(0.25, imagery.record.gsd_m)  # m: step of the correlation, or the pixel of a coarser picture
     parts = shapely.get_parts(buildings)
     outlines = shapely.orient_polygons(parts[~shapely.is_empty(parts)], exterior_cw=False)
-    surfaces = np.array(list(_surfaces(imagery, outlines, mapped, step_m)))
-    if len(surfaces) < LEAST_TILES:
+    found = [_clear_peak_m(surface, step_m) for surface in _surfaces(imagery, outlines, step_m)]
+    peaks = np.array([peak for peak in found if peak is not None])
+    if len(peaks) < LEAST_TILES:
         return None
-    total = surfaces.sum(axis=0)
-    sharpness = float((total.max() - total.mean()) / max(float(total.std()), 1e-12))
-    east_m, north_m = _peak_m(total, step_m)
-    # 5: sharpness in standard deviations: chance alone reaches about 4 in so many offsets
-    if sharpness < 5.0 or max(abs(east_m), abs(north_m)) > REACH_M - step_m:
-        return None
-    weights = rng.multinomial(len(surfaces), np.full(len(surfaces), 1 / len(surfaces)), size=500)
-    drawn = np.array([_peak_m(np.tensordot(weight, surfaces, axes=1), step_m) for weight in weights])
+    offset = np.median(peaks, axis=0)
+    half_m, most_m = np.percentile(np.hypot(*(peaks - offset).T), (50, 90)).round(3).tolist()
+    drawn = np.median(peaks[rng.integers(len(peaks), size=(500, len(peaks)))], axis=1)
     tail = (100 - _LEVEL_PERCENT) / 2
     low, high = np.percentile(drawn, (tail, 100 - tail), axis=0).round(3).tolist()
-    single = np.array([_peak_m(surface, step_m) for surface in surfaces])
+    if half_m > _MOST_RESIDUAL_M or max(high[0] - low[0], high[1] - low[1]) > _MOST_INTERVAL_M:
+        return None
     return OffsetRecord(
-        east_m=round(east_m, 3),
-        north_m=round(north_m, 3),
+        east_m=round(float(offset[0]), 3),
+        north_m=round(float(offset[1]), 3),
         east_interval_m=(low[0], high[0]),
         north_interval_m=(low[1], high[1]),
-        residual_m=round(float(np.median(np.hypot(*(single - (east_m, north_m)).T))), 3),
-        sharpness=round(sharpness, 2),
-        tiles=len(surfaces),
+        residual_m=half_m,
+        residual_90_m=most_m,
+        tiles=len(peaks),
+        of_tiles=len(found),
     )
 
 
-def _surfaces(
-    imagery: Imagery, outlines: NDArray[np.object_], mapped: shapely.Geometry, step_m: float
-) -> Iterator[Surface]:
+def _surfaces(imagery: Imagery, outlines: NDArray[np.object_], step_m: float) -> Iterator[Surface]:
     """Yield the correlation of each tile that holds walls, shape (2 R + 1, 2 R + 1), row down to the south."""
     tree, walls = shapely.STRtree(outlines), shapely.boundary(outlines)
     side = round(TILE_M / step_m)
     reach = round(REACH_M / step_m)
     lattice = Grid.from_bounds(*imagery.record.bounds_m, cell_size_m=step_m, epsg=imagery.epsg)
-    shapely.prepare(mapped)
     for _, _, tile in lattice.windows(side):
         box = shapely.box(*tile.bounds_m)
         near = tree.query(box)
-        if tile.shape != (side, side) or not shapely.contains(mapped, box) or len(near) == 0:
-            continue
-        # 40 m of walls in a tile: with fewer its own offset says little
-        if shapely.length(shapely.intersection(walls[near], box)).sum() < 40.0:
+        # As much of walls as a tile is wide: with fewer its own offset says little
+        if tile.shape != (side, side) or shapely.length(shapely.intersection(walls[near], box)).sum() < TILE_M:
             continue
         around = tile.window(-reach, -reach, side + 2 * reach, side + 2 * reach)
         view = imagery.read(around.bounds_m, gsd_m=step_m)
-        if view.is_known.mean() >= 0.9:  # of a tile that the picture shows
+        if view.is_known.mean() >= 0.75:  # of what a tile may lie on
             yield _correlation(_Edges.of_map(outlines[near], tile), _Edges.of_picture(view.rgb, view.is_known, step_m))
 
 
@@ -578,6 +607,21 @@ def _correlation(on_map: _Edges, seen: _Edges) -> Surface:
     product = fft.fft2(picture, shape) * np.conj(fft.fft2(template, shape))
     count = picture.shape[0] - template.shape[0] + 1
     return np.asarray(fft.ifft2(product)[:count, :count].real)
+
+
+def _clear_peak_m(surface: Surface, step_m: float) -> tuple[float, float] | None:
+    """Return the offset, east and north, at which a surface is highest; None if another peak is about as high.
+
+    Held against the picture of another tile, 3 to 8 % of the tiles of five places have a clear peak.
+    """
+    east_m, north_m = _peak_m(surface, step_m)
+    reach = surface.shape[0] // 2
+    if max(abs(east_m), abs(north_m)) > (reach - 1) * step_m:
+        return None  # it rises beyond the reach
+    at_m = np.arange(-reach, reach + 1) * step_m
+    # 2 m: width of a peak, of blurred edges and of roofs that lean by unlike lengths; two pixels of a coarse picture
+    is_other = np.hypot(at_m[None] - east_m, -at_m[:, None] - north_m) > max(2.0, 2 * step_m)
+    return (east_m, north_m) if surface.max() - surface[is_other].max() > surface.std() else None
 
 
 def _peak_m(surface: Surface, step_m: float) -> tuple[float, float]:

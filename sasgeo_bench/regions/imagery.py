@@ -5,11 +5,11 @@ import datetime as dt
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Self
+from typing import Annotated, Any, ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sasgeo_bench.core.config import Document, JsonDocument, Line
 from sasgeo_bench.core.errors import ImageryError, StoreError
@@ -70,10 +70,12 @@ class PictureRecord(JsonDocument):
 
 
 class OffsetRecord(JsonDocument):
-    """Measured offset of the imagery against the map: where a thing of the map is seen, less where the map has it.
+    """Measured offset of the imagery against the map: where a roof is seen, less where the map has the building.
 
-    `east_m` and `north_m` with their 95 % intervals are of all tiles together; `residual_m` is the median distance of
-    the offset of single tiles from it, `sharpness` the height of the peak in standard deviations of the correlation.
+    `east_m` and `north_m` with their 95 % intervals are the median of the tiles that show it clearly; `residual_m` is
+    the median distance of the offset of such a tile from it, `residual_90_m` the 90th percentile. `tiles` is how many
+    they are, `of_tiles` how many have walls; both newer figures are None in files of earlier versions, whose `tiles`
+    are all with walls.
     """
 
     east_m: float
@@ -81,15 +83,24 @@ class OffsetRecord(JsonDocument):
     east_interval_m: tuple[float, float]
     north_interval_m: tuple[float, float]
     residual_m: Metres
-    sharpness: float
+    residual_90_m: Metres | None = None
     tiles: Annotated[int, Field(ge=1)]
+    of_tiles: Annotated[int, Field(ge=1)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_an_earlier_version(cls, given: Any) -> Any:  # noqa: ANN401 - what a file holds
+        """Leave out the height of the one peak of all tiles, which a file of an earlier version states."""
+        return {key: given[key] for key in given if key != "sharpness"} if isinstance(given, dict) else given
 
     def to_text(self) -> str:
         """Describe in one line by how much the imagery is off."""
         (west, east), (south, north) = self.east_interval_m, self.north_interval_m
+        most = "" if self.residual_90_m is None else f" (90 % under {self.residual_90_m:.2f})"
+        of = "" if self.of_tiles is None else f" of {self.of_tiles}"
         return (
             f"{self.east_m:+.2f} m east ({west:+.2f} to {east:+.2f}), {self.north_m:+.2f} m north ({south:+.2f} to "
-            f"{north:+.2f}), residual {self.residual_m:.2f} m, n = {self.tiles}"
+            f"{north:+.2f}), residual {self.residual_m:.2f} m{most}, n = {self.tiles}{of}"
         )
 
 

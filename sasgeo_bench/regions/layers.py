@@ -565,7 +565,14 @@ def overview_factors(grid: Grid) -> tuple[int, ...]:
     return tuple(4**level for level in range(1, 10) if longest > 2 * BLOCK_CELLS * 4 ** (level - 1))
 
 
-def write_layers(path: Path, grid: Grid, classes: tuple[str, ...], paint: Callable[[int], PaintWindow]) -> None:
+def write_layers(
+    path: Path,
+    grid: Grid,
+    classes: tuple[str, ...],
+    paint: Callable[[int], PaintWindow],
+    *,
+    credit: str = ATTRIBUTION,
+) -> None:
     """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
     `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (C, rows,
@@ -578,7 +585,7 @@ def write_layers(path: Path, grid: Grid, classes: tuple[str, ...], paint: Callab
     """
     factors = overview_factors(grid)
     try:
-        _lay_out(path, grid, classes, factors)
+        _lay_out(path, grid, classes, factors, credit=credit)
         with TiffFile(path, mode="r+") as file, ThreadPoolExecutor(1) as painting, ThreadPoolExecutor(1) as packing:
             levels = list(zip((1, *factors), (page.aspage() for page in file.pages), strict=True))[::-1]
             painters = _in_turn(painting, paint, (factor for factor, _ in levels))
@@ -592,7 +599,7 @@ def write_layers(path: Path, grid: Grid, classes: tuple[str, ...], paint: Callab
         ) from error
 
 
-def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence[int]) -> None:
+def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence[int], *, credit: str) -> None:
     """Write the headers of all levels, with names and licence; no block is stored yet."""
     is_big = len(classes) * grid.rows * grid.cols > 16 * _BIGTIFF_CELLS
     with rasterio.open(
@@ -615,7 +622,7 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence
         bigtiff="YES" if is_big else "NO",
     ) as target:
         target.descriptions = classes
-        target.update_tags(TIFFTAG_COPYRIGHT=ATTRIBUTION, attribution=ATTRIBUTION, licence=LICENCE)
+        target.update_tags(TIFFTAG_COPYRIGHT=credit, attribution=credit, licence=LICENCE)
     with TiffFile(path) as file:
         about = [(tag, "s", 0, file.pages[0].aspage().tags[tag].value, True) for tag in (_COPYRIGHT, _GDAL_METADATA)]
     with TiffWriter(path, append=True) as levels:

@@ -2,7 +2,7 @@
 """Region: grid, layers, graph, features, coverage and provenance; immutable."""
 
 import datetime as dt
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Self, TypeVar, cast
 
@@ -55,10 +55,32 @@ class Provenance(Record):
         Line | None, Field(title="source", description="Where an extract without an address to load it from comes from")
     ] = None
 
+    further_sources: Annotated[
+        Line | None,
+        Field(
+            title="further sources",
+            description="Sources of the map beside OpenStreetMap: classes, whose, and licence; to be named with it",
+        ),
+    ] = None
+
+    @property
+    def credit(self) -> str:
+        """Return whom to name beside what shows the map.
+
+        >>> Provenance(further_sources="building: a land survey (CC0-1.0)").credit
+        '(c) OpenStreetMap contributors, ODbL; building: a land survey (CC0-1.0)'
+        """
+        return "; ".join(filter(None, (ATTRIBUTION, self.further_sources)))
+
     def titled(self) -> dict[str, str]:
         """Return what is stated, by the titles of the lines."""
         stated = {line.title or name: getattr(self, name) for name, line in Provenance.model_fields.items()}
         return {title: str(value) for title, value in stated.items() if value is not None}
+
+
+def credit_of(maps: Iterable[Provenance]) -> str:
+    """Return whom to name beside what shows several maps, each once."""
+    return "; ".join(dict.fromkeys((ATTRIBUTION, *(one.further_sources for one in maps if one.further_sources))))
 
 
 class ExtractRecord(JsonDocument):
@@ -72,6 +94,20 @@ class ExtractRecord(JsonDocument):
     date: dt.date
     osm_timestamp: dt.datetime | None
     also: dict[str, str] = {}
+
+
+class OwnMapRecord(JsonDocument):
+    """A source of some classes beside the extract; `publish`: it, and what is made of it, may be passed on."""
+
+    file: str
+    sha256: str
+    bytes: Count
+    date: dt.date | None
+    classes: tuple[str, ...]
+    licence: str
+    attribution: str
+    publish: bool
+    source: str | None
 
 
 class CoverageRecord(JsonDocument):
@@ -100,10 +136,11 @@ class Manifest(JsonDocument):
 
     `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects in and around the grid by
     reason: not visible from above, not used, repaired. `classes` are those that the map knows of: whatever is of
-    another class is unknown everywhere. `imagery` is None in a region without.
+    another class is unknown everywhere. Those of `own_maps` are from there, all others from the extract. `imagery` is
+    None in a region without.
     """
 
-    without_empty: ClassVar = frozenset({"imagery", "provenance"})
+    without_empty: ClassVar = frozenset({"imagery", "provenance", "own_maps"})
 
     schema_version: int
     data_version: int
@@ -133,6 +170,7 @@ class Manifest(JsonDocument):
     attribution: str
     imagery: OrthoRecord | None = None
     provenance: Provenance = Provenance()
+    own_maps: tuple[OwnMapRecord, ...] = ()
 
     @property
     def grid(self) -> Grid:

@@ -50,11 +50,10 @@ NODES: Final = "nodes.parquet"
 EDGES: Final = "edges.parquet"
 PREVIEW: Final = "preview.png"
 GROUP_ROWS: Final = 2**15  # of features or nodes that are read at once: a town has fewer
-_ORIGIN: Final[Mapping[Any, Any]] = {"attribution": ATTRIBUTION, "licence": LICENCE}
 _MEND: Final = "build the region again"
 
 
-def write_tables(folder: Path, features: "gpd.GeoDataFrame", graph: MapGraph) -> None:
+def write_tables(folder: Path, features: "gpd.GeoDataFrame", graph: MapGraph, *, credit: str = ATTRIBUTION) -> None:
     """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder.
 
     Features that fill several row groups are put in order along a Hilbert curve: a part of a map lies in few of them.
@@ -62,15 +61,18 @@ def write_tables(folder: Path, features: "gpd.GeoDataFrame", graph: MapGraph) ->
     if len(features) > GROUP_ROWS:
         features = features.iloc[np.argsort(features.hilbert_distance().to_numpy(), kind="stable")]
     geographic = {**CHECKED, "schema_version": "1.1.0", "row_group_size": GROUP_ROWS}
-    _attributed(features.reset_index(drop=True)).to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
-    _attributed(graph.nodes).to_parquet(folder / NODES, **geographic)
-    write_frame(graph.edges, folder / EDGES, attrs=_ORIGIN)
+    origin: Mapping[Any, Any] = {"attribution": credit, "licence": LICENCE}
+    _attributed(features.reset_index(drop=True), origin).to_parquet(
+        folder / FEATURES, write_covering_bbox=True, **geographic
+    )
+    _attributed(graph.nodes, origin).to_parquet(folder / NODES, **geographic)
+    write_frame(graph.edges, folder / EDGES, attrs=origin)
 
 
-def _attributed(table: Table) -> Table:
+def _attributed(table: Table, origin: Mapping[Any, Any]) -> Table:
     """Return a shallow copy whose parquet file states attribution and licence (`attrs` in its metadata)."""
     shown = table.copy(deep=False)
-    shown.attrs = dict(_ORIGIN)
+    shown.attrs = dict(origin)
     return shown
 
 
@@ -244,7 +246,13 @@ def read_imagery(path: str | Path) -> Imagery | None:
 
 
 def check_publishable(folder: Path, manifest: Manifest) -> None:
-    """Raise `StoreError` if the imagery of a map must not be passed on; call it before imagery leaves this machine."""
+    """Raise `StoreError` if a map or its imagery must not be passed on; call it before it leaves this machine."""
+    own = next((item for item in manifest.own_maps if not item.publish), None)
+    if own is not None:
+        raise StoreError(
+            f"{folder} is made of {own.file}, whose region file says publish = false (licence: {own.licence}): leave "
+            f"{manifest.id} out, or build it from a region file without that [[own_map]]"
+        )
     if manifest.imagery is None or manifest.imagery.is_publishable:
         return
     kept = next(item for item in manifest.imagery.pictures if not item.publish)

@@ -11,11 +11,11 @@ import pyproj
 import shapely
 from pydantic import ConfigDict, Field, StringConstraints, field_validator, model_validator
 
-from sasgeo_bench.core.config import Line, NamedDocument, find_document, list_documents, read_document
+from sasgeo_bench.core.config import Document, Line, NamedDocument, find_document, list_documents, read_document
 from sasgeo_bench.core.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
-from sasgeo_bench.osm.locate import Extract
+from sasgeo_bench.osm.locate import Extract, PlainName, Sha256
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.imagery import ImageryEntry
 from sasgeo_bench.regions.region import Provenance
@@ -51,6 +51,53 @@ class StatedProvenance(Provenance):
     model_config = ConfigDict(extra="forbid")
 
 
+class OwnMap(Document):
+    """One `[[own_map]]` of a region file: GeoJSON of a source beside OpenStreetMap, and the classes that are from it.
+
+    Such classes are from no extract. Properties are tags, `tags` those that all features have; its mapped ground is
+    that of the region file. `date` is None where it is not known. `publish` says whether the map, and what is made of
+    it, may be passed on.
+
+    >>> from sasgeo_bench.core.config import parse_toml
+    >>> text = '''
+    ... file = "houses.geojson"
+    ... sha256 = ["0000000000000000000000000000000000000000000000000000000000000000"]
+    ... classes = ["building"]
+    ... tags = { building = "yes" }
+    ... licence = "CC0-1.0"
+    ... attribution = "the land survey"
+    ... publish = true
+    ... '''
+    >>> parse_toml(text, OwnMap, source="[[own_map]]").credit
+    'building: the land survey (CC0-1.0)'
+    """
+
+    file: PlainName
+    sha256: Annotated[tuple[Sha256, ...], Field(strict=False, min_length=1)]
+    date: dt.date | None = None
+    classes: Annotated[list[str], Field(min_length=1)]
+    tags: dict[str, Line] = {}
+    licence: Line
+    attribution: Line
+    publish: bool
+    source: Line | None = None
+
+    @field_validator("classes")
+    @classmethod
+    def _classes_are_known(cls, names: list[str]) -> list[str]:
+        return _checked_classes(names)
+
+    @property
+    def credit(self) -> str:
+        """Return which classes are from it, whose it is, and its licence."""
+        return f"{', '.join(self.classes)}: {self.attribution} ({self.licence})"
+
+    def beside(self, extract: Extract) -> Extract:
+        """Return it as an extract, to be found as such; of the day of the one beside it if it states none."""
+        date = self.date or extract.date
+        return Extract(file=self.file, date=date, sha256=self.sha256, format="geojson", tags=self.tags)
+
+
 class RegionFile(NamedDocument):
     """Definition of one region: identity, place, cell size and dated extracts.
 
@@ -71,7 +118,9 @@ class RegionFile(NamedDocument):
     (256, 256)
     """
 
-    without_empty: ClassVar = frozenset({"coverage_parts_lonlat", "classes", "largest_view_m", "imagery", "provenance"})
+    without_empty: ClassVar = frozenset(
+        {"coverage_parts_lonlat", "classes", "largest_view_m", "imagery", "provenance", "own_map"}
+    )
 
     id: Identifier
     title: Line
@@ -86,6 +135,7 @@ class RegionFile(NamedDocument):
     classes: Annotated[list[str], Field(min_length=1)] | None = None
     largest_view_m: Annotated[float, Field(gt=0)] | None = None
     extract: Annotated[list[Extract], Field(min_length=1)]
+    own_map: list[OwnMap] = []
     imagery: list[ImageryEntry] = []
     provenance: StatedProvenance = StatedProvenance()
 
@@ -125,11 +175,7 @@ class RegionFile(NamedDocument):
     @field_validator("classes")
     @classmethod
     def _classes_are_known(cls, names: list[str] | None) -> list[str] | None:
-        known = load_taxonomy().names
-        strange = next((name for name in names or () if name not in known), None)
-        if strange is not None:
-            raise ValueError(f"classes has {strange!r}, which is no class: there are {', '.join(known)}")
-        return names
+        return names if names is None else _checked_classes(names)
 
     @model_validator(mode="after")
     def _coverage_is_stated_once(self) -> Self:
@@ -141,6 +187,24 @@ class RegionFile(NamedDocument):
                 "an extract of format 'geojson' holds some classes in some places: say which by classes and by "
                 "coverage_lonlat or coverage_parts_lonlat, above [[extract]]; all else is unknown"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _has_one_source_of_a_class(self) -> Self:
+        names = [name for one in self.own_map for name in one.classes]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"[[own_map]] gives {twice!r} twice: a class is from one source")
+        strange = next((name for name in names if name not in self.class_names), None)
+        if strange is not None:
+            raise ValueError(f"[[own_map]] gives {strange!r}, which `classes` lacks: add it there")
+        if names and self.stated_coverage() is None:
+            raise ValueError(
+                "[[own_map]] holds some classes in some places: say where they and the extract are complete by "
+                "coverage_lonlat or coverage_parts_lonlat, above [[extract]]; all else is unknown"
+            )
+        if names and not self.extract_classes:
+            raise ValueError("[[own_map]] gives every class: leave one to [[extract]], or make the map an extract")
         return self
 
     @model_validator(mode="after")
@@ -187,6 +251,19 @@ class RegionFile(NamedDocument):
     def class_names(self) -> tuple[str, ...]:
         """Return the classes of the map, in the order of their ids: those of `classes`, or all."""
         return tuple(name for name in load_taxonomy().names if self.classes is None or name in self.classes)
+
+    @property
+    def extract_classes(self) -> tuple[str, ...]:
+        """Return the classes that are from the extract: all but those of `own_map`."""
+        own = {name for one in self.own_map for name in one.classes}
+        return tuple(name for name in self.class_names if name not in own)
+
+    @property
+    def origin(self) -> Provenance:
+        """Return the lines of provenance, with those sources that are no extract."""
+        further = [*filter(None, [self.provenance.further_sources]), *(one.credit for one in self.own_map)]
+        stated = {name: getattr(self.provenance, name) for name in self.provenance.model_fields_set}
+        return Provenance(**stated | ({"further_sources": "; ".join(further)} if further else {}))
 
     def stated_coverage(self) -> shapely.Geometry | None:
         """Return the mapped area as stated, in longitude and latitude; None if it is to be estimated."""
@@ -238,6 +315,14 @@ class RegionFile(NamedDocument):
             known = ", ".join(sorted(item.date.isoformat() for item in self.extract))
             raise ConfigError(f"{self.id} has no extract of {date.isoformat()}; there are {known}")
         return found
+
+
+def _checked_classes(names: list[str]) -> list[str]:
+    known = load_taxonomy().names
+    strange = next((name for name in names if name not in known), None)
+    if strange is not None:
+        raise ValueError(f"classes has {strange!r}, which is no class: there are {', '.join(known)}")
+    return names
 
 
 def _checked_ring(ring: list[Corner], key: str) -> list[Corner]:

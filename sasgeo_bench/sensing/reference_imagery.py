@@ -25,7 +25,7 @@ from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.imagery import ORTHO, Bounds, Imagery, OrthoRecord, PictureRecord, RenderedRecord
 from sasgeo_bench.regions.layers import OUTSIDE, Paint, burn_layers, make_paint
 from sasgeo_bench.regions.ortho import OrthoTile, lattice_within, write_tiles
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest, Region
+from sasgeo_bench.regions.region import LICENCE, Manifest, Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage
@@ -283,8 +283,8 @@ def _picture(manifest: Manifest, shown: Manifest, look: Look) -> PictureRecord:
         bytes=extract.bytes,
         date=extract.date,
         licence=LICENCE,
-        attribution=ATTRIBUTION,
-        publish=True,
+        attribution=shown.attribution,
+        publish=all(own.publish for own in shown.own_maps),
         source=_SOURCE,
         gsd_m=look.gsd_m,
         rendered=RenderedRecord(
@@ -316,7 +316,7 @@ def _render_into(scratch: Path, rendering: _Rendering) -> OrthoRecord:
     bounds = np.array([manifest.bounds_m])
     grid = lattice_within(bounds, manifest.grid, finest_m=rendering.look.gsd_m)
     tiles = _tiles(rendering, grid)
-    if not write_tiles(scratch / ORTHO, grid, tiles, attribution=ATTRIBUTION, licence=LICENCE):
+    if not write_tiles(scratch / ORTHO, grid, tiles, attribution=rendering.picture.attribution, licence=LICENCE):
         raise ImageryError(f"{folder.name} of {rendering.picture.date} has no mapped ground: take another date")
     # Record with the share of the region's mapped ground that is shown
     # There is no offset to measure: the image lies on the map that it shows.

@@ -90,14 +90,14 @@ def paint_difference(seen: Evidence, mapped: Evidence) -> NDArray[np.float64]:
     return picture
 
 
-def write_sheet(path: Path, *, title: str, panels: Sequence[Panel]) -> None:
-    """Write a contact sheet as PNG."""
-    figure = sheet_figure(title, panels)
+def write_sheet(path: Path, *, title: str, panels: Sequence[Panel], credit: str = ATTRIBUTION) -> None:
+    """Write a contact sheet as PNG; `credit` says whose the map is."""
+    figure = sheet_figure(title, panels, credit=credit)
     FigureCanvasAgg(figure)
-    figure.savefig(path, format="png", metadata={"Title": title, "Copyright": ATTRIBUTION, "Software": None})
+    figure.savefig(path, format="png", metadata={"Title": title, "Copyright": credit, "Software": None})
 
 
-def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Figure:
+def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI, credit: str = ATTRIBUTION) -> Figure:
     """Draw a contact sheet as a figure."""
     has_vectors = any(panel.query.vectors is not None for panel in panels)
     rivals = list(dict.fromkeys(panel.rival for panel in panels)) or [DECOY]
@@ -131,7 +131,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
                 chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=9, transform=chart.transAxes)
             if at == 0:
                 chart.set_title(name, fontsize=10, pad=3)
-    figure.text(0.15 / width, 0.06 / height, ATTRIBUTION, fontsize=8)
+    figure.text(0.15 / width, 0.06 / height, credit, fontsize=8)
     return figure
 
 
@@ -510,7 +510,7 @@ def write_flight_sheet(path: Path, task: Task, shown: Sequence[FlightPanel]) -> 
         title=f"{about.title}: {about.region}",
         facts=f"{about.what} {_IN_A_ROW if row_is_site else ''}Number of a stress: {about.strength_unit}.",
         note="North is up. inspect --query ID draws one flight alone, or the sheet of one view by its whole id.",
-        data=ATTRIBUTION,
+        data=manifest.attribution,
         rows=1 + max((row for row, _ in places), default=0),
         columns=across,
         panel_inches=(inches, inches),

@@ -754,9 +754,12 @@ def write_task(
     frozen = hashlib.sha256()
     frames = 0
     labels: Any = None  # a writer, opened at the first picture
+    credit = origin.provenance.credit
     with ExitStack() as stack:
         queries, truths = (
-            stack.enter_context(table_writer(path, schema, compression_level=9))
+            stack.enter_context(
+                table_writer(path, schema.with_metadata(_META | {"attribution": credit}), compression_level=9)
+            )
             for path, schema in ((task_folder / QUERIES, FILE_SCHEMA), (truth_folder / TRUTH, TRUTH_SCHEMA))
         )
         for part in _batches(pairs):
@@ -787,7 +790,7 @@ def write_task(
         **({"frames": frames} if frames else {}),
         "files": {QUERIES: record.model_dump()},
         "licence": LICENCE,
-        "attribution": ATTRIBUTION,
+        "attribution": credit,
     }
     more = {} if hidden is None else hidden.model_dump(mode="json", exclude_unset=True, exclude={"queries_sha256"})
     _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **more})

@@ -75,12 +75,13 @@ class Request(Settings):
 
     @property
     def extracts(self) -> tuple[Extract, ...]:
-        """Return the extracts of all maps that the queries are drawn from."""
+        """Return the extracts of all maps that the queries are drawn from, and maps of one's own beside them."""
         needs = self.found.card.needs
         dates = older_dates(self.region, needs)
         is_asked = "another region" in needs or "another picture" in needs
         others = [self.elsewhere.pick(None)] if is_asked and self.elsewhere is not None else []
-        return (*map(self.region.pick, (None, *dates)), *others)
+        own = [one.beside(self.region.pick(None)) for one in self.region.own_map]
+        return (*map(self.region.pick, (None, *dates)), *own, *others)
 
 
 @dataclass(frozen=True, kw_only=True)

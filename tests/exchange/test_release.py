@@ -42,7 +42,7 @@ from sasgeo_bench.regions.imagery import ORTHO, ImageryEntry, OrthoRecord
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.ortho import check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.preview import write_preview
-from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.regions.region import ATTRIBUTION, OwnMapRecord
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest
 from sasgeo_bench.running.plan import RunRequest, reach_of
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
@@ -365,6 +365,33 @@ def test_sha256sum_checks_every_file(written: Path) -> None:
     done = subprocess.run(command, cwd=written, capture_output=True, text=True, check=True)  # noqa: S603 - of PATH
     listed = {line.removesuffix(": OK") for line in done.stdout.splitlines()}
     assert listed == {path.relative_to(written).as_posix() for path in _files(written)} - {"SHA256SUMS"}
+
+
+def test_a_source_of_a_map_beside_openstreetmap_is_named_with_it(source: Path, tmp_path: Path) -> None:
+    out = Path(shutil.copytree(source, tmp_path / "out"))
+    folder, further = out / "regions" / GRID, "building: a land survey (CC0-1.0)"
+    manifest = read_manifest(folder)
+    provenance = manifest.provenance.model_copy(update={"further_sources": further})
+    stated = {"provenance": provenance, "attribution": provenance.credit}
+    write_manifest(folder, manifest.model_copy(update=stated))
+    _release(out, tmp_path / FOLDER, with_truth=True)
+    texts = ("README.md", "LICENSE-ODbL.txt", "release.json", "stac/catalog.json", "zenodo.json", "datasheet.md")
+    for name in (*texts, "croissant.json"):
+        assert f"{ATTRIBUTION}; {further}" in (tmp_path / FOLDER / name).read_text(encoding="utf-8"), name
+    own = OwnMapRecord(
+        file="survey.geojson",
+        sha256="0" * 64,
+        bytes=1,
+        date=None,
+        classes=("building",),
+        licence="all rights reserved",
+        attribution="a land survey",
+        publish=False,
+        source=None,
+    )
+    write_manifest(folder, manifest.model_copy(update={"own_maps": (own,)}))
+    with pytest.raises(StoreError, match=f"publish = false .*all rights reserved.*: leave {GRID} out"):
+        _release(out, tmp_path / "kept", with_truth=True)
 
 
 def test_every_file_names_its_source_and_licence_in_itself(written: Path) -> None:

@@ -60,8 +60,8 @@ class Hamlet:
     picture: str = "mosaic.tif"
     extra: str = ""
 
-    def spec(self) -> RegionFile:
-        """Return the region file."""
+    def text(self) -> str:
+        """Return the text of the region file."""
         ring = to_lonlat(shapely.box(WEST + 20, SOUTH + 20, WEST + SIDE_M - 20, SOUTH + SIDE_M - 20))
         bounds = to_lonlat(shapely.box(WEST, SOUTH, WEST + SIDE_M, SOUTH + SIDE_M)).bounds
         text = SPEC.format(
@@ -72,7 +72,11 @@ class Hamlet:
             publish=str(self.publish).lower(),
             sha256=sha256_of(self.folder / self.picture),
         )
-        return parse_toml(text + self.extra, RegionFile, source="hamlet.toml")
+        return text + self.extra
+
+    def spec(self) -> RegionFile:
+        """Return the region file."""
+        return parse_toml(self.text(), RegionFile, source="hamlet.toml")
 
     def but(self, **changes: object) -> "Hamlet":
         """Return the place with other settings."""

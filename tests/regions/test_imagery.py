@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Aerial pictures of a place: cut, reprojected, held against the map, read window by window; bad ones are refused."""
 
+import datetime as dt
 import re
 import shutil
 from pathlib import Path
@@ -88,7 +89,7 @@ def test_the_offset_of_the_picture_is_measured_and_of_one_of_elsewhere_none_is_g
     assert offset.east_interval_m[0] - 0.1 <= OFF_M[0] <= offset.east_interval_m[1] + 0.1
     assert offset.residual_m < 0.5
     assert offset.tiles >= 9
-    other = make_hamlet(tmp_path / "other", seed=8)
+    other = make_hamlet(tmp_path / "other", seed=8, off_m=(13.0, 15.0))  # its houses stand between those of the map
     shutil.copy(hamlet.folder / "houses.geojson", other.folder / "houses.geojson")
     assert read_manifest(build(other, tmp_path)).imagery.offset is None
 
@@ -231,6 +232,23 @@ def test_a_truncated_picture_is_refused_and_an_older_region_stays(hamlet, built,
     assert [path.name for path in (out / "regions").iterdir() if "partial" in path.name] == []
 
 
+def test_of_every_region_one_whose_picture_is_not_here_costs_no_other(hamlet, program, tmp_path):
+    files = tmp_path / "files"
+    files.mkdir()
+    text = hamlet.text()
+    (files / "hamlet.toml").write_text(text, encoding="utf-8")
+    plain = text[: text.index("[[imagery]]")].replace('id = "hamlet"', 'id = "plain"')
+    (files / "plain.toml").write_text(plain, encoding="utf-8")
+    Path(shutil.copytree(hamlet.folder, tmp_path / "extracts") / "mosaic.tif").unlink()
+    places = ("--region-files", files, "--extracts", tmp_path / "extracts", "--out", tmp_path / "out")
+    code, _, err = program("build-region", "--every", *places)
+    assert code == 2
+    (line,) = [line for line in err.splitlines() if "mosaic.tif" in line]
+    assert re.match(r"hamlet: not built: mosaic\.tif \(SHA-256 .*\) was not found: put it into ", line)
+    assert err.splitlines()[-1].endswith("not built: 1 region (hamlet) of 2; the lines above say why")
+    assert read_manifest(tmp_path / "out" / "regions" / "plain").imagery is None
+
+
 def test_imagery_must_say_whether_it_may_be_passed_on_and_is_refused_where_not(hamlet, tmp_path):
     folder = build(hamlet.but(publish=False), tmp_path)
     with pytest.raises(
@@ -243,7 +261,7 @@ def test_imagery_must_say_whether_it_may_be_passed_on_and_is_refused_where_not(h
 
 @pytest.mark.slow
 @pytest.mark.real
-@pytest.mark.parametrize(("name", "most_m", "tiles"), [("zanzibar", 0.3, 6), ("banepa", 0.1, 40)])
+@pytest.mark.parametrize(("name", "most_m", "tiles"), [("zanzibar", 0.3, 4), ("banepa", 0.1, 30)])
 def test_a_real_mosaic_lies_on_its_map(name, most_m, tiles, tmp_path):
     spec = read_region_file(list_region_files()[name])
     if name == "zanzibar":  # its southern part is enough
@@ -261,3 +279,35 @@ def test_a_real_mosaic_lies_on_its_map(name, most_m, tiles, tmp_path):
     assert max(abs(manifest.imagery.offset.east_m), abs(manifest.imagery.offset.north_m)) < most_m
     assert manifest.imagery.offset.tiles >= tiles
     assert manifest.imagery.is_publishable == (name == "banepa")
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_a_map_that_holds_few_of_the_houses_has_no_offset(tmp_path):
+    spec = read_region_file(list_region_files()["andorra-la-vella-ortho"])
+    try:
+        plan = plan_build(spec, out=tmp_path, date=dt.date(2017, 2, 19))
+    except (ExtractError, ImageryError) as error:
+        pytest.skip(f"real imagery: {error}")
+    assert build_region(plan).imagery.offset is None
+
+
+# Bounds: twice what separate measurements of clear patches gave, and never under 1 m east or north
+@pytest.mark.slow
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("name", "half_m", "most_m"),
+    [("pardubice-ortho", 2.0, 5.0), ("chateaugiron-ortho", 2.0, 6.0), ("andorra-la-vella-ortho", 3.0, 8.0)],
+)
+def test_a_real_orthophoto_lies_a_metre_or_two_off_its_map_and_its_offset_is_measured(name, half_m, most_m, tmp_path):
+    try:
+        plan = plan_build(read_region_file(list_region_files()[name]), out=tmp_path)
+    except (ExtractError, ImageryError) as error:
+        pytest.skip(f"real imagery: {error}")
+    offset = build_region(plan).imagery.offset
+    assert max(abs(offset.east_m), abs(offset.north_m)) < 1.5
+    widths = [high - low for low, high in (offset.east_interval_m, offset.north_interval_m)]
+    assert max(widths) < 1.5
+    assert 0.3 < offset.residual_m < half_m
+    assert offset.residual_m < offset.residual_90_m < most_m
+    assert offset.of_tiles > offset.tiles >= 30

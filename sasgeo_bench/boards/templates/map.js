@@ -50,7 +50,7 @@ async function openPlace() {
   fill(field("suite"), [...new Set(place.queries.map((one) => one[SUITE]))].sort(), "all");
   if (!map) {
     map = L.map("map", { crs: L.CRS.Simple, minZoom: -5, maxZoom: 3, zoomSnap: 0.25, attributionControl: true });
-    map.attributionControl.setPrefix("Leaflet").addAttribution("(c) OpenStreetMap contributors, ODbL");
+    map.attributionControl.setPrefix("Leaflet").addAttribution({{ about.credit | e | tojson }});
     L.control.scale({ imperial: false, position: "topright" }).addTo(map);
   }
   map.eachLayer((layer) => layer.remove());

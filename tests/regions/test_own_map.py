@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map of one's own beside OpenStreetMap: each class is from one source, and both are named wherever one is."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import rasterio
+import rasterio.features
+import shapely
+from affine import Affine
+
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.core.errors import ConfigError, ExtractError, ImageryError, StoreError
+from sasgeo_bench.core.folders import sha256_of
+from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.regions.region_files import check_publishable, read_manifest, read_region
+from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
+from tests.regions.imagery_place import write_houses
+
+EPSG, WEST, SOUTH, SIDE_M = 32632, 500_000.0, 5_210_000.0, 512.0  # as of `write_houses`
+INNER = shapely.box(WEST + 32, SOUTH + 32, WEST + SIDE_M - 32, SOUTH + SIDE_M - 32)
+HOUSES = [
+    shapely.box(WEST + x, SOUTH + y, WEST + x + 14, SOUTH + y + 10)
+    for x in range(20, 480, 60)
+    for y in range(20, 480, 60)
+]
+CREDIT = "building: a land survey (CC0-1.0)"
+OWN = """
+[[own_map]]
+file = "survey.geojson"
+sha256 = ["{sha256}"]
+classes = {classes}
+tags = {{ building = "yes" }}
+licence = "CC0-1.0"
+attribution = "a land survey"
+publish = {publish}
+"""
+
+
+def lonlat(shape: shapely.Geometry) -> shapely.Geometry:
+    back = to_lonlat(EPSG)
+    return shapely.transform(shape, lambda at: np.column_stack(back.transform(*at.T)))
+
+
+def text_of(*own: str, classes: str = '["road_major", "road_minor", "building"]', has_ring: bool = True) -> str:
+    """A region file: an embedded town, and maps of one's own beside it."""
+    middle = lonlat(shapely.box(WEST, SOUTH, WEST + SIDE_M, SOUTH + SIDE_M).centroid)
+    ring = [list(corner) for corner in lonlat(INNER).exterior.coords[:-1]]
+    return f"""
+id = "mine"
+title = "A town and a survey"
+scenes = ["suburban"]
+center_lonlat = [{middle.x}, {middle.y}]
+size_m = [{SIDE_M}, {SIDE_M}]
+cell_size_m = 1.0
+epsg = {EPSG}
+classes = {classes}
+{f"coverage_lonlat = {ring}" if has_ring else ""}
+[[extract]]
+file = "town.osm.pbf"
+date = 2024-01-01
+town = {{ morphology = "suburb", seed = 3, size_m = {SIDE_M} }}
+{"".join(own)}"""
+
+
+def spec_of(*own: str, **changes: object) -> RegionFile:
+    return parse_toml(text_of(*own, **changes), RegionFile, source="mine.toml")
+
+
+def own_of(folder: Path, *, classes: str = '["building"]', publish: str = "true") -> str:
+    """A map of one's own, with its file."""
+    write_houses(folder / "survey.geojson", HOUSES)
+    return OWN.format(sha256=sha256_of(folder / "survey.geojson"), classes=classes, publish=publish)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the survey."""
+    return tmp_path_factory.mktemp("survey")
+
+
+@pytest.fixture(scope="module")
+def spec(folder: Path) -> RegionFile:
+    return spec_of(own_of(folder))
+
+
+@pytest.fixture(scope="module")
+def built(spec: RegionFile, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    plan = plan_build(spec, out=tmp_path_factory.mktemp("out"), extract_folders=[folder], with_preview=True)
+    build_region(plan)
+    return plan.folder
+
+
+def test_its_classes_are_its_own_and_the_others_those_of_the_extract(built, tmp_path):
+    region = read_region(built)
+    grid = region.grid
+    transform = Affine(*grid.transform)
+    seen = [shapely.intersection(house, INNER) for house in HOUSES if house.intersects(INNER)]
+    expected = rasterio.features.rasterize(seen, out_shape=grid.shape, transform=transform)
+    known = rasterio.features.geometry_mask([INNER], out_shape=grid.shape, transform=transform, invert=True)
+    buildings = region.layer("building")
+    assert (buildings[~known] == 255).all()
+    assert (buildings[known] == expected[known]).all()
+    assert len(region.features[region.features["class"] == "building"]) == len(HOUSES)
+    alone = plan_build(spec_of(classes='["road_major", "road_minor"]'), out=tmp_path)
+    build_region(alone)
+    roads = read_region(alone.folder)
+    for name in ("road_major", "road_minor"):
+        assert (region.layer(name) == roads.layer(name)).all()
+    assert (region.layer("road_minor") == 1).any()
+    assert region.classes == ("road_major", "road_minor", "building")
+
+
+def test_it_is_named_wherever_openstreetmap_is(built):
+    manifest, credit = read_manifest(built), f"{ATTRIBUTION}; {CREDIT}"
+    assert manifest.attribution == credit
+    assert manifest.provenance.further_sources == CREDIT
+    assert manifest.licence == "ODbL-1.0"
+    (own,) = manifest.own_maps
+    assert (own.classes, own.licence, own.attribution, own.date) == (("building",), "CC0-1.0", "a land survey", None)
+    assert own.file == "survey.geojson"
+    with rasterio.open(built / "layers.tif") as layers:
+        assert layers.tags()["attribution"] == layers.tags()["TIFFTAG_COPYRIGHT"] == credit
+    for name in ("features", "nodes", "edges"):
+        metadata = pq.read_schema(built / f"{name}.parquet").metadata
+        assert any(CREDIT.encode() in value for value in metadata.values()), name
+    assert CREDIT.encode() in (built / "preview.png").read_bytes()
+
+
+def test_it_is_an_input_of_the_region(spec, folder, built):
+    out = built.parent.parent
+    assert plan_build(spec, out=out, extract_folders=[folder]).is_current
+    other = spec.model_copy(update={"own_map": [spec.own_map[0].model_copy(update={"attribution": "another"})]})
+    assert not plan_build(other, out=out, extract_folders=[folder]).is_current
+    assert "survey.geojson" in plan_build(spec, out=out, extract_folders=[folder]).to_text()
+    with pytest.raises(ExtractError, match=r"^survey\.geojson \(SHA-256 .*\) was not found: put it into"):
+        plan_build(spec, out=out)
+
+
+def test_a_map_that_must_not_be_passed_on_is_refused(folder, tmp_path):
+    plan = plan_build(spec_of(own_of(folder, publish="false")), out=tmp_path, extract_folders=[folder])
+    with pytest.raises(StoreError, match=r"survey\.geojson, whose region file says publish = false .*: leave mine out"):
+        check_publishable(plan.folder, build_region(plan))
+
+
+@pytest.mark.parametrize(
+    ("own", "changes", "fault"),
+    [
+        (['["building"]', '["building"]'], {}, "gives 'building' twice: a class is from one source"),
+        (['["water"]'], {}, "gives 'water', which `classes` lacks: add it there"),
+        (['["building"]'], {"has_ring": False}, "say where they and the extract are complete by coverage_lonlat"),
+        (['["building"]'], {"classes": '["building"]'}, "gives every class: leave one to"),
+        (['["bulding"]'], {}, "classes has 'bulding', which is no class"),
+    ],
+)
+def test_what_it_cannot_be_is_refused_in_a_line(own, changes, fault, folder):
+    with pytest.raises(ConfigError) as found:
+        spec_of(*(own_of(folder, classes=classes) for classes in own), **changes)
+    assert fault in str(found.value)
+    assert "\n" not in str(found.value)
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_koeln_has_roads_of_one_source_and_buildings_of_another_and_without_it_none(tmp_path):
+    specs = [read_region_file(list_region_files()[name]) for name in ("koeln-ortho", "koeln-ortho-osm")]
+    try:
+        both, alone = (build_region(plan_build(spec, out=tmp_path)) for spec in specs)
+    except (ExtractError, ImageryError) as error:
+        pytest.skip(f"real imagery: {error}")
+    assert both.attribution == f"{ATTRIBUTION}; building: Geobasis NRW, LoD2 (dl-de/zero-2-0)"
+    assert alone.attribution == ATTRIBUTION
+    assert both.counts["building"] > 400
+    assert {name: both.counts[name] for name in alone.classes} == alone.counts
+    assert "building" not in alone.classes
+    assert max(abs(both.imagery.offset.east_m), abs(both.imagery.offset.north_m)) < 0.5
+    assert both.imagery.offset.residual_90_m < 1.5
+    assert alone.imagery.offset is None  # roads have no walls
+    x, y = from_lonlat(both.epsg).transform(6.9720, 50.9390)
+    assert not shapely.from_wkt(both.coverage.wkt).contains(shapely.Point(x, y))

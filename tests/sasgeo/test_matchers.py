@@ -23,6 +23,7 @@ from sasgeo_bench.sasgeo.variants import (
     SasgeoFresh,
     SasgeoFreshAgeless,
     SasgeoGraph,
+    SasgeoHard,
     SasgeoIndependent,
     SasgeoNoGraph,
     SasgeoPrior,
@@ -47,6 +48,7 @@ ALL = (
     SasgeoNoGraph,
     SasgeoEven,
     SasgeoIndependent,
+    SasgeoHard,
 )
 LEARNERS = {*ALL} - {SasgeoRaster, SasgeoRasterVectors, SasgeoPrior}
 

@@ -161,7 +161,7 @@ def test_undecided_probabilities_are_unknown_and_others_beyond_0_to_1_are_refuse
     chances = np.array([[[0.2, 0.5, 0.8]]])
     seen = Evidence.of_probabilities(("a",), chances, cell_size_m=1.0, present_at=0.7, absent_at=0.3)
     assert seen.cells.tolist() == [[[0, UNKNOWN, PRESENT]]]
-    with pytest.raises(ShapeError, match="got -0.1"):
+    with pytest.raises(ShapeError, match=r"got -0\.1"):
         Evidence.of_probabilities(("a",), np.array([[[0.5, -0.1]]]), cell_size_m=1.0)
 
 

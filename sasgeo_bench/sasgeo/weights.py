@@ -103,8 +103,8 @@ def weigh(levels: NDArray[np.uint16], gains: Gains) -> tuple[NDArray[np.float32]
     Examples
     --------
     >>> weights, known = weigh(np.array([[[510, 0, 511, 255]]], dtype=np.uint16), even_gains(np.ones(1)))
-    >>> weights[0, 0].round(2).tolist()
-    [2.0, -1.0, 0.0, 0.81]
+    >>> weights[0, 0].round(2)
+    array([ 2.  , -1.  ,  0.  ,  0.81], dtype=float32)
     """
     weights = np.zeros(levels.shape, dtype=np.float32)
     known = np.zeros(levels.shape[1:], dtype=np.float32)

@@ -89,8 +89,8 @@ REACH_M: Final = 4.0
 SOURCE: Final = "SASGeo paper (Trukhina and Vashkelis), Eqs. 7-8 and variant {variant} of its Section VI"
 OURS: Final = (
     "Distance made a degree by exp(-D^2 / 2 tau^2), tau 4 m, for the classes drawn as lines, on the map, and in the "
-    "view as an excuse for what seems missed; all gains 1; a cell with a probability counts by it; division by the "
-    "cells that count; the search over place, heading and scale (the paper ranks ten windows)"
+    "view as an excuse for what seems missed; all gains 1; division by the cells that count; the search over place, "
+    "heading and scale (the paper ranks ten windows)"
 )
 GRAPH: Final = (
     "graph descriptor: for every class the number of connected patches of at least 9 m2 (8 neighbours) and a histogram "
@@ -151,8 +151,7 @@ class RasterMatcher(DenseMatcher):
             if name in THIN:
                 into[:] = fade(layer == PRESENT, reach_cells=self.reach_m / evidence.cell_size_m)
         weights = stability(evidence.classes) if self.switches.is_stable else np.ones(len(evidence.classes))
-        gains = VoteGains(agree=weights, extra=weights, missed=weights)
-        return make_template(evidence.cells, gains, near=near, chances=evidence.probabilities())
+        return make_template(evidence.cells, VoteGains(agree=weights, extra=weights, missed=weights), near=near)
 
     def rescored(self, modes: list[Mode], check: PoseCheck) -> list[Mode]:
         """Return the modes with scores of raster and graph."""
@@ -181,7 +180,7 @@ class FullUnknown(RasterMatcher):
 
     card = MatcherCard(
         name="full_unknown",
-        version="3",
+        version="2",
         title="The paper's full model: stability, graph descriptor, unknown ignored",
         source=SOURCE.format(variant=5),
         ours=(
@@ -200,7 +199,7 @@ class RasterGraph(RasterMatcher):
 
     card = MatcherCard(
         name="raster_graph",
-        version="3",
+        version="2",
         title="Raster matching and graph descriptor",
         source=SOURCE.format(variant=3),
         ours=f"{OURS}; {GRAPH}; {UNKNOWN_IS_ABSENT}",
@@ -216,7 +215,7 @@ class RasterGraphStability(RasterMatcher):
 
     card = MatcherCard(
         name="raster_graph_stability",
-        version="3",
+        version="2",
         title="Stability-weighted raster matching and graph descriptor",
         source=SOURCE.format(variant=4),
         ours=f"{OURS}; {GRAPH}; {STABLE}; {UNKNOWN_IS_ABSENT}",
@@ -232,7 +231,7 @@ class RasterUniform(RasterMatcher):
 
     card = MatcherCard(
         name="raster_uniform",
-        version="4",
+        version="3",
         title="Raster matching with uniform weights",
         source=SOURCE.format(variant=2),
         ours=f"{OURS}; {UNKNOWN_IS_ABSENT}",

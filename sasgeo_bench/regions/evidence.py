@@ -174,6 +174,15 @@ class Evidence:
         """Return the same view with other cells (and confidence, none by default)."""
         return type(self)(classes=self.classes, cells=cells, cell_size_m=self.cell_size_m, confidence=confidence)
 
+    @cached_property
+    def is_certain(self) -> bool:
+        """Return whether every known cell is present or absent for certain.
+
+        >>> Evidence.of_probabilities(("water",), np.array([[[1.0, np.nan]]]), cell_size_m=1.0).is_certain
+        True
+        """
+        return self.confidence is None or bool((self.confidence[self.cells != UNKNOWN] == CERTAIN).all())
+
     def without_unknown(self) -> Self:
         """Return the view with unknown cells as absent for certain.
 

@@ -122,7 +122,9 @@ class SasgeoMatcher:
         if query.track == "retrieval":
             return _of_candidates(reading, self.plan, top_k=top_k)
         starts = reading.proposed()
-        found = search(self._reader.field, reading.template, query.prior, self.plan, count=LISTED, starts=starts)
+        found = search(
+            self._reader.field, reading.template, query.prior, reading.plan(self.plan), count=LISTED, starts=starts
+        )
         if not found.modes:
             return WITHHELD
         ranked = _ranked(reading, found.modes)
@@ -179,7 +181,7 @@ def _answer(
 def _of_candidates(reading: Reading, plan: Plan, *, top_k: int) -> Match:
     """Rank the candidates of a query; drop those off the map."""
     query = reading.query
-    found, null = rank(reading.reader.field, reading.template, query.prior, query.candidates, plan)
+    found, null = rank(reading.reader.field, reading.template, query.prior, query.candidates, reading.plan(plan))
     scored = sorted(((at, mode) for at, mode in enumerate(found) if mode is not None), key=lambda item: -item[1].score)
     if not scored:
         return WITHHELD
@@ -497,7 +499,7 @@ class SasgeoHard(LearningMatcher):
         _GRAPH_FITTED,
         _SILENT,
         limits=_UNTAUGHT,
-        reads="of a view with probabilities each cell is the likelier of present and absent, as in version 3 of "
-        "`sasgeo`: it tells what probabilities are worth",
+        reads="of a view with probabilities each cell is the likelier of present and absent: it tells what "
+        "probabilities are worth",
     )
     switches = Switches(reads_probabilities=False)

@@ -155,6 +155,9 @@ def test_evidence_without_confidence_is_certain():
     assert seen.probabilities()[0, 0, :2].tolist() == [0.0, 1.0]
     sure = seen.replace(cells, np.array([[[255, 255, 0]]], dtype=np.uint8))
     assert (sure.levels() == seen.levels()).all()
+    assert seen.is_certain
+    assert sure.is_certain
+    assert not seen.replace(cells, np.array([[[255, 254, 0]]], dtype=np.uint8)).is_certain
 
 
 def test_undecided_probabilities_are_unknown_and_others_beyond_0_to_1_are_refused():

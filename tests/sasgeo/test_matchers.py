@@ -32,6 +32,7 @@ from sasgeo_bench.sasgeo.variants import (
     SasgeoStability,
     SasgeoStamped,
 )
+from sasgeo_bench.search.plan import Plan
 
 ALL = (
     SasgeoRaster,
@@ -130,6 +131,15 @@ def test_a_view_in_which_no_class_is_likely_is_read_by_its_probabilities(tiny):
     ]
     assert off_m[0] < 5.0
     assert off_m[1] > 5.0
+
+
+def test_a_view_with_probabilities_is_searched_on_smaller_cells(tiny, whole):
+    query, _ = first(tiny, "localization")
+    view = query.evidence
+    chances = np.where(view.cells == UNKNOWN, np.nan, np.where(view.cells == PRESENT, 0.9, 0.1))
+    soft = replace(query, evidence=Evidence.of_probabilities(view.classes, chances, cell_size_m=view.cell_size_m))
+    found = [whole._reader.read(one).plan(Plan()) for one in (query, soft)]
+    assert found == [Plan(), replace(Plan(), cells=2 * Plan().cells)]
 
 
 @pytest.mark.parametrize("arm", [Sasgeo, SasgeoRaster])

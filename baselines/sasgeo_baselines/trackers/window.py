@@ -32,7 +32,7 @@ class Raster(RasterMatcher):
 
     card = sgb.MatcherCard(
         name="raster_of_trackers",
-        version="2",
+        version="1",
         title="Raster matching by stability, unknown ignored",
         source="SASGeo paper (Trukhina and Vashkelis), Eqs. 7-8 and variants 4 and 5 of its Section VI, without graph",
         ours=f"{OURS}; {STABLE}; what is unknown in the view is silent",

@@ -84,7 +84,7 @@ class MaplocnetRegress(PlaceMatcher[PreparedView]):
 
     card = MatcherCard(
         name="maplocnet_regress",
-        version="1",
+        version="2",
         title="Control: a pose regressed from a coarse surface of scores",
         source=(
             "Wu et al., MapLocNet: Coarse-to-Fine Feature Registration for Visual Re-Localization in Navigation Maps, "
@@ -212,7 +212,8 @@ def _shrunk(layer: NDArray[np.bool_], factor: int) -> NDArray[np.uint8]:
 def templates_of(seen: Evidence, classes: Sequence[str]) -> tuple[Template, Template]:
     """Return the votes of a view for the classes of a map, and how many of them are known in each cell."""
     shared = [name for name in seen.classes if name in classes]
-    votes = make_template(np.stack([seen.layer(name) for name in shared]), VoteGains.uniform(len(shared)))
+    at = [seen.classes.index(name) for name in shared]
+    votes = make_template(seen.cells[at], VoteGains.uniform(len(shared)), chances=seen.probabilities()[at])
     weights = np.zeros((len(classes), *seen.shape), dtype=np.float32)
     for name, band in zip(shared, votes, strict=False):
         weights[classes.index(name)] = band

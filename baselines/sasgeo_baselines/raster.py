@@ -140,11 +140,9 @@ class RasterMatcher(DenseMatcher):
         """Return the map with the proximity of its lines."""
         return Chart.of(region, thin=THIN, reach_m=self.reach_m)
 
-    def seen(self, cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def seen(self, evidence: Evidence) -> Evidence:
         """Return unknown cells as absent, unless this variant ignores them."""
-        if self.switches.is_unknown_silent:
-            return cells
-        return np.where(cells == UNKNOWN, ABSENT, cells).astype(np.uint8)
+        return evidence if self.switches.is_unknown_silent else evidence.without_unknown()
 
     def template(self, evidence: Evidence) -> NDArray[np.float64]:
         """Return the template; a line mapped near a seen one is not missed."""

@@ -7,29 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.raster import REACH_M, THIN
-from sasgeo_bench import PRESENT, UNKNOWN, Chart, DenseMatcher, Evidence, MatcherCard, Region, VotePlan
+from sasgeo_bench import Chart, DenseMatcher, Evidence, MatcherCard, Region, VotePlan
 
 # A place of which the map knows half would be judged by half of the view, whose covariance varies more.
 LEAST_OVERLAP: Final = 0.9
 _FULL: Final = 255
-_HALF: Final = 0.5
-
-
-def probabilities(evidence: Evidence) -> NDArray[np.float64]:
-    """Return P(present) of each class and cell, shape (C, rows, cols); NaN where unknown.
-
-    Confidence is |2 P - 1| in steps of 1/255, as `SoftView.to_evidence` writes it; evidence without is certain.
-
-    >>> cells = np.array([[[1, 0, 2]]], dtype=np.uint8)
-    >>> sure = np.array([[[102, 51, 0]]], dtype=np.uint8)
-    >>> seen = Evidence(classes=("water",), cells=cells, cell_size_m=1.0, confidence=sure)
-    >>> probabilities(seen).round(2).tolist()
-    [[[0.7, 0.4, nan]]]
-    """
-    cells = evidence.cells
-    sureness = np.ones(cells.shape) if evidence.confidence is None else evidence.confidence / _FULL
-    found = np.where(cells == PRESENT, _HALF + sureness / 2, _HALF - sureness / 2)
-    return np.where(cells == UNKNOWN, np.nan, found)
 
 
 def soft_template(chances: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -109,4 +91,4 @@ class RasterSoft(DenseMatcher):
 
     def template(self, evidence: Evidence) -> NDArray[np.float64]:
         """Return the template of the view's probabilities."""
-        return soft_template(probabilities(evidence), np.array([self._shares[name] for name in evidence.classes]))
+        return soft_template(evidence.probabilities(), np.array([self._shares[name] for name in evidence.classes]))

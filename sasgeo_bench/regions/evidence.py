@@ -8,6 +8,7 @@ from typing import Final, Self
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy.special import logit
 
 from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
@@ -18,6 +19,13 @@ PRESENT: Final = 1
 UNKNOWN: Final = 2
 
 _STATES: Final = 3
+CERTAIN: Final = 255  # the confidence of what is certain
+_HALF: Final = 0.5
+
+LEVELS: Final = 2 * CERTAIN  # steps of probability that a state and its confidence can tell
+SILENT: Final = LEVELS + 1  # the level of an unknown cell
+_CHANCES: Final = np.append(_HALF + np.arange(-CERTAIN, CERTAIN + 1) / CERTAIN / 2, np.nan)  # by level
+_OF_STATE: Final = np.array([0, LEVELS, SILENT], dtype=np.uint16)  # level of each state that has no confidence
 _MOST_CLASSES: Final = 31
 _NOT_KNOWN: Final = np.uint32(1 << 31)
 
@@ -31,8 +39,9 @@ class Evidence:
     """The state of each class and cell, as observed in one view; `ShapeError` if shapes, types or values do not fit.
 
     Row 0 of `cells`, uint8 of shape (C, rows, cols), is the top of the view; a cell is ABSENT, PRESENT or UNKNOWN and
-    `cell_size_m` wide on the ground, for scale 1. `confidence` is that of perception, 0..255, of the same shape. Both
-    arrays are made read-only.
+    `cell_size_m` wide on the ground, for scale 1. `confidence` is that of perception, 255 * |2 P - 1| for a probability
+    P that the class is there, of the same shape; without it, known cells are certain. Both arrays are made read-only.
+    `of_probabilities` makes evidence of probabilities, `probabilities` and `log_odds` read them back.
     """
 
     classes: tuple[str, ...]
@@ -58,6 +67,94 @@ class Evidence:
             self.confidence.flags.writeable = False
         self.cells.flags.writeable = False
 
+    @classmethod
+    def of_probabilities(
+        cls,
+        classes: tuple[str, ...],
+        probabilities: NDArray[np.floating],
+        *,
+        cell_size_m: float,
+        present_at: float = _HALF,
+        absent_at: float = _HALF,
+    ) -> Self:
+        """Make evidence of the probability that each class is there.
+
+        Parameters
+        ----------
+        classes : tuple of str
+            Names of the classes.
+        probabilities : ndarray of float, shape (C, rows, cols)
+            P(present), 0..1; NaN where nothing is known.
+        cell_size_m : float
+            Side of a cell on the ground for scale 1, metres.
+        present_at, absent_at : float
+            A cell is PRESENT from `present_at` on, ABSENT below `absent_at` or at it, UNKNOWN between: nothing is kept
+            of a probability there.
+
+        Raises
+        ------
+        ShapeError
+            If shapes do not fit, or a probability is not within 0..1.
+
+        Examples
+        --------
+        >>> seen = Evidence.of_probabilities(("water",), np.array([[[0.9, 0.25, np.nan]]]), cell_size_m=1.0)
+        >>> seen.cells.tolist(), seen.confidence.tolist()
+        ([[[1, 0, 2]]], [[[204, 128, 0]]])
+        >>> seen.probabilities().round(2).tolist()
+        [[[0.9, 0.25, nan]]]
+        """
+        filled = np.nan_to_num(probabilities, nan=_HALF)
+        if filled.size and not (filled.min() >= 0 and filled.max() <= 1):
+            raise ShapeError(
+                f"probabilities lie in 0..1, got {filled.min():g}..{filled.max():g}: NaN says that nothing is known"
+            )
+        cells = np.full(probabilities.shape, UNKNOWN, dtype=np.uint8)
+        cells[probabilities <= absent_at] = ABSENT
+        cells[probabilities >= present_at] = PRESENT
+        confidence = np.where(cells == UNKNOWN, 0, np.rint(CERTAIN * np.abs(2 * filled - 1))).astype(np.uint8)
+        return cls(classes=classes, cells=cells, cell_size_m=cell_size_m, confidence=confidence)
+
+    def levels(self) -> NDArray[np.uint16]:
+        """Return the probability of each class and cell in whole steps, shape (C, rows, cols).
+
+        0 is absent for certain, `LEVELS` (510) present for certain, `SILENT` unknown. A table by level reads evidence
+        cell by cell at no more cost than one by state.
+
+        >>> cells = np.array([[[1, 0, 2]]], dtype=np.uint8)
+        >>> Evidence(classes=("water",), cells=cells, cell_size_m=1.0).levels().tolist()
+        [[[510, 0, 511]]]
+        """
+        if self.confidence is None:
+            return _OF_STATE.take(self.cells)
+        off = self.confidence.astype(np.int16)
+        found = np.where(self.cells == PRESENT, CERTAIN + off, CERTAIN - off).astype(np.uint16)
+        found[self.cells == UNKNOWN] = SILENT
+        return found
+
+    def probabilities(self) -> NDArray[np.float64]:
+        """Return P(present) of each class and cell, shape (C, rows, cols), in steps of 1/510; NaN where unknown.
+
+        Evidence without confidence is certain: a present cell is 1, an absent one 0.
+
+        >>> cells = np.array([[[1, 0, 2]]], dtype=np.uint8)
+        >>> Evidence(classes=("water",), cells=cells, cell_size_m=1.0).probabilities().tolist()
+        [[[1.0, 0.0, nan]]]
+        """
+        return _CHANCES.take(self.levels())
+
+    def log_odds(self) -> NDArray[np.float64]:
+        """Return ln(P / (1 - P)) of each class and cell, shape (C, rows, cols); 0 where unknown: no evidence.
+
+        The outer levels stand for half a step each, so that none is infinite: at most 7.6 either way.
+
+        >>> cells = np.array([[[1, 0, 2]]], dtype=np.uint8)
+        >>> Evidence(classes=("water",), cells=cells, cell_size_m=1.0).log_odds().round(1).tolist()
+        [[[7.6, -7.6, 0.0]]]
+        """
+        edge = 1 / (4 * LEVELS)
+        return np.asarray(logit(np.clip(np.nan_to_num(self.probabilities(), nan=_HALF), edge, 1 - edge)))
+
     @property
     def shape(self) -> tuple[int, int]:
         """Return rows and columns."""
@@ -76,6 +173,28 @@ class Evidence:
     def replace(self, cells: NDArray[np.uint8], confidence: NDArray[np.uint8] | None = None) -> Self:
         """Return the same view with other cells (and confidence, none by default)."""
         return type(self)(classes=self.classes, cells=cells, cell_size_m=self.cell_size_m, confidence=confidence)
+
+    @cached_property
+    def is_certain(self) -> bool:
+        """Return whether every known cell is present or absent for certain.
+
+        >>> Evidence.of_probabilities(("water",), np.array([[[1.0, np.nan]]]), cell_size_m=1.0).is_certain
+        True
+        """
+        return self.confidence is None or bool((self.confidence[self.cells != UNKNOWN] == CERTAIN).all())
+
+    def without_unknown(self) -> Self:
+        """Return the view with unknown cells as absent for certain.
+
+        >>> seen = Evidence.of_probabilities(("water",), np.array([[[0.9, np.nan]]]), cell_size_m=1.0)
+        >>> seen.without_unknown().probabilities().round(2).tolist()
+        [[[0.9, 0.0]]]
+        """
+        is_unknown = self.cells == UNKNOWN
+        cells = np.where(is_unknown, np.uint8(ABSENT), self.cells)
+        return self.replace(
+            cells, None if self.confidence is None else np.where(is_unknown, np.uint8(CERTAIN), self.confidence)
+        )
 
     def layer(self, class_name: str) -> NDArray[np.uint8]:
         """Return the cells of one class, shape (rows, cols)."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.sasgeo.raster import with_unknown_margins
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import Gains, even_gains, likelihood_gains
@@ -26,6 +26,7 @@ class Switches:
     training views on an older map are moved to the map of their own day. `burns_vectors` reads the perceived vectors as
     a second raster view, so that an arm without a graph sees what one with a graph sees. `correlates` takes errors of
     a class to hang together, else each cell counts alone: see `raster.RasterView.levelled` and `damped`.
+    `reads_probabilities` of views that have some, else each cell is the likelier of present and absent.
     """
 
     weights: Weights = "fitted"
@@ -37,6 +38,7 @@ class Switches:
     learns_from_old: bool = True
     burns_vectors: bool = False
     correlates: bool = True
+    reads_probabilities: bool = True
 
     @property
     def learns(self) -> bool:
@@ -45,9 +47,10 @@ class Switches:
 
     def seen(self, evidence: Evidence) -> Evidence:
         """Return a view as this ablation reads it."""
+        if not self.reads_probabilities:
+            evidence = evidence.replace(evidence.cells)
         if not self.is_unknown_silent:
-            cells = np.where(evidence.cells == UNKNOWN, ABSENT, evidence.cells).astype(np.uint8)
-            evidence = Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
+            evidence = evidence.without_unknown()
         return with_unknown_margins(evidence)
 
     def gains(self, model: ScorerModel, *, age_years: float, season: str = "") -> Gains:

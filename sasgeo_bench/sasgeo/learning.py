@@ -334,7 +334,9 @@ WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
 def _list(query: Query, pose: Pose, reader: Reader, plan: Plan, classes: tuple[str, ...]) -> _ScoredModes:
     """Score the true pose of a view and the wrong modes that a search finds; 0 in classes that the map lacks."""
     reading = reader.read(query)
-    modes = search(reader.field, reading.template, query.prior, plan, count=16).modes  # of each training search
+    modes = search(
+        reader.field, reading.template, query.prior, reading.plan(plan), count=16
+    ).modes  # of each training search
     here = (pose.easting_m, pose.northing_m)
     wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
     poses = [pose, *wrong]

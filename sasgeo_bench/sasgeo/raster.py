@@ -168,7 +168,7 @@ def with_unknown_margins(evidence: Evidence) -> Evidence:
         if name in load_taxonomy().lines and (layer == PRESENT).any():
             off = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
             layer[(layer == ABSENT) & (off * evidence.cell_size_m <= DOUBT_M)] = UNKNOWN
-    return Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
+    return evidence.replace(cells, evidence.confidence)
 
 
 def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
@@ -260,9 +260,10 @@ class RasterView:
         """Weigh the classes that a view shares with a map."""
         shape = (len(classes), *evidence.shape)
         weights, known = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+        levels = evidence.levels()
         for at, name in enumerate(classes):
             if name in evidence.classes:
-                found, known[at] = weigh(evidence.layer(name)[None], gains.only(at))
+                found, known[at] = weigh(levels[[evidence.classes.index(name)]], gains.only(at))
                 weights[at] = found[0]
         return cls(weights=weights, known=known, cell_size_m=evidence.cell_size_m)
 

@@ -26,6 +26,7 @@ from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, read_field, wi
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
+from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.tasks.query import Query
 
 APART_M: Final = (30.0, 180.0)  # of two junctions: nearer ones give no heading, farther ones are seldom both in a view
@@ -207,6 +208,7 @@ class Reader:
         return Reading(reader=self, query=query)
 
 
+_FAINT: Final = 2  # times the cells of the coarsest level, see `Reading.plan`; from pictures of train places
 LEAST_SIGMA_M: Final = 1.0  # of a refined position: half a cell of the search
 
 
@@ -271,6 +273,13 @@ class Reading:
         # 20 poses by the graph, of a view of any heading
         found = proposals(self.observed, graph, count=20, scales=(1 - reach, 1 + reach), prior=prior)
         return [item.pose for item in found]
+
+    def plan(self, plan: Plan) -> Plan:
+        """Return how the view is searched: from cells half as large if it has probabilities, whoever reads them.
+
+        Where no class is certain, a place stands out on large cells too little to stay within the beam.
+        """
+        return plan if self.query.evidence.is_certain else replace(plan, cells=_FAINT * plan.cells)
 
     def by_class(self, poses: Sequence[Pose]) -> NDArray[np.float64]:
         """Return scores of Eq. 8 by class before scaling, shape (M, C)."""

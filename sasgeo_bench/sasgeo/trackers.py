@@ -11,7 +11,8 @@ from sasgeo_bench.sasgeo.temporal import SasgeoTrack as _Base
 _OURS: Final = (
     "raster by log-likelihood ratios learnt on train places, without graph; a belief over cells and headings in place "
     f"of lists of modes, moved by the odometer and spread by its covariance; cells of {CELL_M:g} m and more; a view "
-    f"weighs by {FRESH:g} of its fitted exponents times the share of its ground that is new"
+    f"weighs by {FRESH:g} of its fitted exponents times the share of its ground that is new; a cell seen with a "
+    "probability has the logarithm of its expected likelihood ratio"
 )
 _NONE: Final = f"a view fits no place with probability {NONE:g}"
 _RIVAL: Final = (
@@ -31,7 +32,7 @@ _LIMITS: Final = (
 def _card(name: str, title: str, *ours: str, equations: str = "Eqs. 5, 7-8, 10-12") -> MatcherCard:
     return MatcherCard(
         name=name,
-        version="2",
+        version="3",
         title=title,
         source=f"SASGeo paper (Trukhina and Vashkelis), {equations}",
         ours="; ".join((_OURS, "the scale of the flight's views is learnt as it goes", *ours, _ACCEPTS)),

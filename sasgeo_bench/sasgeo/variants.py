@@ -122,7 +122,9 @@ class SasgeoMatcher:
         if query.track == "retrieval":
             return _of_candidates(reading, self.plan, top_k=top_k)
         starts = reading.proposed()
-        found = search(self._reader.field, reading.template, query.prior, self.plan, count=LISTED, starts=starts)
+        found = search(
+            self._reader.field, reading.template, query.prior, reading.plan(self.plan), count=LISTED, starts=starts
+        )
         if not found.modes:
             return WITHHELD
         ranked = _ranked(reading, found.modes)
@@ -179,7 +181,7 @@ def _answer(
 def _of_candidates(reading: Reading, plan: Plan, *, top_k: int) -> Match:
     """Rank the candidates of a query; drop those off the map."""
     query = reading.query
-    found, null = rank(reading.reader.field, reading.template, query.prior, query.candidates, plan)
+    found, null = rank(reading.reader.field, reading.template, query.prior, query.candidates, reading.plan(plan))
     scored = sorted(((at, mode) for at, mode in enumerate(found) if mode is not None), key=lambda item: -item[1].score)
     if not scored:
         return WITHHELD
@@ -231,16 +233,21 @@ _BURNT: Final = (
     "show a class, each counts half: the rival of the graph with the same sensor"
 )
 _BURNT_LIMITS: Final = "of vectors it reads where they lie, not how they connect or pass over each other"
+_SOFT: Final = (
+    "a cell seen with a probability has the logarithm of its expected likelihood ratio, so that a certain one counts "
+    "as in Eq. 7"
+)
 _UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIMITS}"
 
 
-def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -> MatcherCard:
+def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS, reads: str = _SOFT) -> MatcherCard:
+    has_graph = bool({_GRAPH_FITTED, _GRAPH_BY_HAND}.intersection(ours))
     return MatcherCard(
         name=name,
-        version=str(1 + (_CORRELATED in ours) + bool({_GRAPH_FITTED, _GRAPH_BY_HAND}.intersection(ours))),
+        version=str(1 + (reads == _SOFT) + (_CORRELATED in ours) + has_graph),
         title=title,
         source=f"SASGeo paper (Trukhina and Vashkelis), {what}",
-        ours="; ".join((_OURS, *ours)),
+        ours="; ".join((_OURS, reads, *ours)),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         limits=limits,
@@ -478,3 +485,21 @@ class SasgeoIndependent(LearningMatcher):
         limits=_UNTAUGHT,
     )
     switches = Switches(correlates=False)
+
+
+class SasgeoHard(LearningMatcher):
+    """The whole scorer that reads states alone."""
+
+    card = _card(
+        "sasgeo_hard",
+        "SASGeo, probabilities read as states",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _CORRELATED,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=_UNTAUGHT,
+        reads="of a view with probabilities each cell is the likelier of present and absent: it tells what "
+        "probabilities are worth",
+    )
+    switches = Switches(reads_probabilities=False)

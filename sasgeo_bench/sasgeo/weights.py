@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from sasgeo_bench.osm.taxonomy import Season, load_taxonomy
-from sasgeo_bench.regions.evidence import ABSENT, PRESENT
+from sasgeo_bench.regions.evidence import ABSENT, LEVELS, PRESENT, SILENT
 from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.rates import ClassRates, Tally
@@ -78,26 +78,51 @@ def _ratios(rates: ClassRates, age_years: float, persists: float) -> tuple[float
     return agree, extra, missed, quiet
 
 
-def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def weigh(levels: NDArray[np.uint16], gains: Gains) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the linear form of Eq. 8: factors of map classes and of known map cells, as in `search.field.Template`.
 
-    `cells` and the first factors have shape (C, rows, cols), the second (rows, cols). Unknown cells are 0 in both.
+    Parameters
+    ----------
+    levels : ndarray of uint16, shape (C, rows, cols)
+        Probabilities of a view, as `Evidence.levels` returns them.
+    gains : Gains
+        Of the same classes.
+
+    Returns
+    -------
+    tuple of ndarray of float32
+        The first of shape (C, rows, cols), the second (rows, cols). Unknown cells are 0 in both.
+
+    Notes
+    -----
+    With P the probability that a cell shows the class, its gain is the logarithm of the expected likelihood ratio:
+    ln(P exp(agree) + (1 - P) exp(missed)) where the class is mapped, ln(P exp(extra) + (1 - P) exp(quiet)) elsewhere.
+    At P = 1 and P = 0 these are the gains of Eq. 7. With gains of `likelihood_gains`, a P that equals the share of all
+    cells that are seen present says nothing.
 
     Examples
     --------
-    >>> weights, known = weigh(np.array([[[1, 0, 2]]], dtype=np.uint8), even_gains(np.ones(1)))
-    >>> weights[0, 0]
-    array([ 2., -1.,  0.], dtype=float32)
+    >>> weights, known = weigh(np.array([[[510, 0, 511, 255]]], dtype=np.uint16), even_gains(np.ones(1)))
+    >>> weights[0, 0].round(2)
+    array([ 2.  , -1.  ,  0.  ,  0.81], dtype=float32)
     """
-    weights = np.zeros(cells.shape, dtype=np.float32)
-    known = np.zeros(cells.shape[1:], dtype=np.float32)
-    parts = zip(cells, gains.agree, gains.extra, gains.missed, gains.quiet, strict=True)
+    weights = np.zeros(levels.shape, dtype=np.float32)
+    known = np.zeros(levels.shape[1:], dtype=np.float32)
+    parts = zip(levels, gains.agree, gains.extra, gains.missed, gains.quiet, strict=True)
     for into, (view, agree, extra, missed, quiet) in zip(weights, parts, strict=True):
-        values = np.zeros((2, 3), dtype=np.float32)
-        values[:, PRESENT], values[:, ABSENT] = (agree - extra, extra), (missed - quiet, quiet)
-        into[:] = values[0][view]
-        known += values[1][view]
+        mapped, empty = _by_level(agree, missed), _by_level(extra, quiet)
+        into[:] = (mapped - empty).astype(np.float32).take(view)
+        known += empty.astype(np.float32).take(view)
     return weights, known
+
+
+def _by_level(present: float, absent: float) -> NDArray[np.float64]:
+    """Return the gain of each level of probability, shape (LEVELS + 2,), from those of present and absent cells."""
+    chance = np.arange(LEVELS + 1) / LEVELS
+    gains = np.zeros(SILENT + 1)
+    gains[:SILENT] = np.log(chance * np.exp(present) + (1 - chance) * np.exp(absent))
+    gains[0], gains[LEVELS] = absent, present  # exactly: evidence without probabilities is read as it always was
+    return gains
 
 
 def information(rates: ClassRates, *, age_years: float, persists: float = 1.0) -> float:

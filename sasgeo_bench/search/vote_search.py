@@ -36,14 +36,18 @@ class VoteGains:
 
 
 def make_template(
-    seen: NDArray[np.uint8], gains: VoteGains, *, near: NDArray[np.float32] | None = None
+    seen: NDArray[np.uint8],
+    gains: VoteGains,
+    *,
+    near: NDArray[np.float32] | None = None,
+    chances: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float64]:
     """Return the factors of the map in Eq. (8), which is linear in the map, shape (C + 2, rows, cols).
 
     `seen` has shape (C, rows, cols). C bands are for the degree to which the map holds each class; one for known map
     cells (the loss of what is seen, regained where it is mapped); the last counts the classes known in the view.
     `near`, 0..1, is the proximity of the class in the view: it reduces the loss for mapped cells that are seen to be
-    absent.
+    absent. `chances` are `Evidence.probabilities`: a cell then counts P as present and 1 - P as absent.
 
     Examples
     --------
@@ -54,6 +58,9 @@ def make_template(
     made = np.zeros((count + 2, *seen.shape[1:]))
     for index, view in enumerate(seen):
         present, absent = (view == PRESENT).astype(np.float64), (view == ABSENT).astype(np.float64)
+        if chances is not None:
+            is_known = view != UNKNOWN
+            present, absent = (np.where(is_known, part, 0.0) for part in (chances[index], 1 - chances[index]))
         if near is not None:
             absent *= 1 - near[index]
         made[index] = (gains.agree[index] + gains.extra[index]) * present - gains.missed[index] * absent

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.core.errors import CameraError, ShapeError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence, cell_offsets_m
+from sasgeo_bench.regions.evidence import Evidence, cell_offsets_m
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.ground import Dem, Ground
 
@@ -30,7 +30,6 @@ STANDING_M: Final[Mapping[str, float]] = MappingProxyType(
 
 _MOST_CELLS: Final = 4096  # a side of a view
 _HALF: Final = 0.5
-_FULL: Final = 255
 
 
 class Seen(Protocol):
@@ -89,12 +88,13 @@ class SoftView:
         [[[1, 2, 2]]]
         """
         reading = reading or Reading()
-        cells = np.full(self.probabilities.shape, UNKNOWN, dtype=np.uint8)
-        cells[self.probabilities <= reading.absent_at] = ABSENT
-        cells[self.probabilities >= reading.present_at] = PRESENT
-        sureness = np.abs(2 * np.nan_to_num(self.probabilities, nan=_HALF) - 1)
-        confidence = np.where(cells == UNKNOWN, 0, np.rint(_FULL * sureness)).astype(np.uint8)
-        return Evidence(classes=self.classes, cells=cells, cell_size_m=self.cell_size_m, confidence=confidence)
+        return Evidence.of_probabilities(
+            self.classes,
+            self.probabilities,
+            cell_size_m=self.cell_size_m,
+            present_at=reading.present_at,
+            absent_at=reading.absent_at,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

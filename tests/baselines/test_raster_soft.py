@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from sasgeo_baselines.raster_soft import RasterSoft, probabilities, soft_template
+from sasgeo_baselines.raster_soft import RasterSoft, soft_template
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
@@ -75,6 +75,6 @@ def test_level_and_contrast_change_no_order(chances, more, times) -> None:
 
 def test_what_is_unknown_is_silent() -> None:
     seen = Evidence(classes=("water",), cells=np.array([[[PRESENT, ABSENT, UNKNOWN]]], dtype=np.uint8), cell_size_m=1.0)
-    made = soft_template(probabilities(seen), np.array([0.3]))
+    made = soft_template(seen.probabilities(), np.array([0.3]))
     assert made[:, 0, 2].tolist() == [0.0, 0.0, 0.0]
     assert made[0, 0, :2].tolist() == [0.5, -0.5]

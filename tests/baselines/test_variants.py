@@ -103,7 +103,8 @@ def test_neither_side_of_the_graph_is_described_where_the_other_is_unknown(made)
     assert distance(replace(here, easting_m=9000.0), scene(HOUSES)) == 0.0  # beyond the map
     half = scene(HOUSES)
     half[:, :, :24] = UNKNOWN  # hides two houses of four
-    missed, silent = (distance(here, variant().seen(half)[:1]) for variant in (RasterGraphStability, FullUnknown))
+    view = Evidence(classes=tuple(map(str, range(len(half)))), cells=half, cell_size_m=1.0)
+    missed, silent = (distance(here, variant().seen(view).cells[:1]) for variant in (RasterGraphStability, FullUnknown))
     # 2 against 4 counts 2 / 7, and their distances differ; 2 against the same 2 is nothing.
     assert missed > (2 / 7) / 2
     assert silent == 0.0

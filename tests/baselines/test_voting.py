@@ -79,6 +79,17 @@ def test_a_pose_scores_as_what_is_seen_from_it(made, east_m, north_m, yaw_deg, s
         assert found == pytest.approx(expected, rel=1e-4, abs=1e-5)
 
 
+@given(cells=arrays(np.uint8, (3, 4, 4), elements=st.integers(0, 2)), gains=GAINS)
+def test_probabilities_vote_as_the_mean_of_states_that_are_drawn_with_them(cells, gains) -> None:
+    quarter = np.where(cells == UNKNOWN, np.nan, 0.25)
+    seen, other = (np.where(cells == UNKNOWN, UNKNOWN, state).astype(np.uint8) for state in (PRESENT, ABSENT))
+    found = make_template(cells, gains, chances=quarter)
+    expected = 0.25 * make_template(seen, gains) + 0.75 * make_template(other, gains)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    certain = np.where(cells == UNKNOWN, np.nan, cells)
+    np.testing.assert_array_equal(make_template(cells, gains, chances=certain), make_template(cells, gains))
+
+
 def test_what_fades_does_not_depend_on_where_in_memory_it_lies(made) -> None:
     present = made.textured(1, side=96)[1] == 1
     rng = np.random.default_rng(0)

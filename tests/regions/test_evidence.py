@@ -130,3 +130,45 @@ def test_evidence_cannot_be_changed_and_says_what_is_wrong_with_it():
 def test_a_cell_unknown_in_one_class_is_unknown_in_all_whatever_the_others_say():
     layers = np.array([[[UNKNOWN, PRESENT, 0]], [[PRESENT, UNKNOWN, PRESENT]]], dtype=np.uint8)
     assert LayerBits.of(layers).bits.tolist() == [[1 << 31, 1 << 31, 2]]
+
+
+@given(hnp.arrays(np.float64, (2, 3, 4), elements=st.floats(0, 1) | st.just(np.nan)))
+def test_probabilities_come_back_to_half_a_step_and_their_states_and_log_odds_follow(chances):
+    seen = Evidence.of_probabilities(("a", "b"), chances, cell_size_m=1.0)
+    back, is_known = seen.probabilities(), np.isfinite(chances)
+    assert (np.isfinite(back) == is_known).all()
+    assert np.abs(back - chances)[is_known].max(initial=0) <= 0.5 / 510 + 1e-12
+    assert ((seen.cells == UNKNOWN) == ~is_known).all()
+    assert ((seen.cells == PRESENT) == (np.nan_to_num(chances) >= 0.5)).all()
+    odds = seen.log_odds()
+    inner = is_known & (back > 0) & (back < 1)
+    assert np.allclose(odds[inner], np.log(back[inner] / (1 - back[inner])))
+    assert (odds[~is_known] == 0).all()
+    assert np.isfinite(odds).all()
+    assert (np.isfinite(back) == (seen.levels() <= 510)).all()
+
+
+def test_evidence_without_confidence_is_certain():
+    cells = np.array([[[0, 1, 2]]], dtype=np.uint8)
+    seen = Evidence(classes=("a",), cells=cells, cell_size_m=1.0)
+    assert seen.levels().tolist() == [[[0, 510, 511]]]
+    assert seen.probabilities()[0, 0, :2].tolist() == [0.0, 1.0]
+    sure = seen.replace(cells, np.array([[[255, 255, 0]]], dtype=np.uint8))
+    assert (sure.levels() == seen.levels()).all()
+    assert seen.is_certain
+    assert sure.is_certain
+    assert not seen.replace(cells, np.array([[[255, 254, 0]]], dtype=np.uint8)).is_certain
+
+
+def test_undecided_probabilities_are_unknown_and_others_beyond_0_to_1_are_refused():
+    chances = np.array([[[0.2, 0.5, 0.8]]])
+    seen = Evidence.of_probabilities(("a",), chances, cell_size_m=1.0, present_at=0.7, absent_at=0.3)
+    assert seen.cells.tolist() == [[[0, UNKNOWN, PRESENT]]]
+    with pytest.raises(ShapeError, match=r"got -0\.1"):
+        Evidence.of_probabilities(("a",), np.array([[[0.5, -0.1]]]), cell_size_m=1.0)
+
+
+def test_unknown_cells_as_absent_are_certain_and_the_others_stay():
+    seen = Evidence.of_probabilities(("a",), np.array([[[0.9, np.nan, 0.3]]]), cell_size_m=1.0)
+    assert seen.without_unknown().levels().tolist() == [[[459, 0, 153]]]
+    assert seen.replace(seen.cells).without_unknown().levels().tolist() == [[[510, 0, 0]]]

@@ -23,6 +23,7 @@ from sasgeo_bench.sasgeo.variants import (
     SasgeoFresh,
     SasgeoFreshAgeless,
     SasgeoGraph,
+    SasgeoHard,
     SasgeoIndependent,
     SasgeoNoGraph,
     SasgeoPrior,
@@ -31,6 +32,7 @@ from sasgeo_bench.sasgeo.variants import (
     SasgeoStability,
     SasgeoStamped,
 )
+from sasgeo_bench.search.plan import Plan
 
 ALL = (
     SasgeoRaster,
@@ -47,6 +49,7 @@ ALL = (
     SasgeoNoGraph,
     SasgeoEven,
     SasgeoIndependent,
+    SasgeoHard,
 )
 LEARNERS = {*ALL} - {SasgeoRaster, SasgeoRasterVectors, SasgeoPrior}
 
@@ -109,6 +112,43 @@ def test_every_arm_finds_a_noise_free_view(tiny, arm):
     match = check_match(prepared(arm, tiny.region).match(query, top_k=5), query, top_k=5)
     best = match.poses[0]
     assert math.dist((best.easting_m, best.northing_m), (truth.pose.easting_m, truth.pose.northing_m)) < 5.0
+
+
+def test_a_view_in_which_no_class_is_likely_is_read_by_its_probabilities(tiny):
+    query, truth = first(tiny, "localization", kind="no error")
+    query = near(query, truth)
+    view = query.evidence
+    chances = np.where(view.cells == PRESENT, 0.4, 0.02)
+    chances[view.cells == UNKNOWN] = np.nan
+    faint = Evidence.of_probabilities(view.classes, chances, cell_size_m=view.cell_size_m)
+    assert not (faint.cells == PRESENT).any()
+    best, hard = (
+        prepared(arm, tiny.region).match(replace(query, evidence=faint), top_k=1).poses[0]
+        for arm in (Sasgeo, SasgeoHard)
+    )
+    off_m = [
+        math.dist((at.easting_m, at.northing_m), (truth.pose.easting_m, truth.pose.northing_m)) for at in (best, hard)
+    ]
+    assert off_m[0] < 5.0
+    assert off_m[1] > 5.0
+
+
+def test_a_view_with_probabilities_is_searched_on_smaller_cells(tiny, whole):
+    query, _ = first(tiny, "localization")
+    view = query.evidence
+    chances = np.where(view.cells == UNKNOWN, np.nan, np.where(view.cells == PRESENT, 0.9, 0.1))
+    soft = replace(query, evidence=Evidence.of_probabilities(view.classes, chances, cell_size_m=view.cell_size_m))
+    found = [whole._reader.read(one).plan(Plan()) for one in (query, soft)]
+    assert found == [Plan(), replace(Plan(), cells=2 * Plan().cells)]
+
+
+@pytest.mark.parametrize("arm", [Sasgeo, SasgeoRaster])
+def test_certain_probabilities_change_no_answer(tiny, arm):
+    query = near(*first(tiny, "localization"))
+    view = query.evidence
+    sure = view.replace(view.cells, np.where(view.cells == UNKNOWN, np.uint8(0), np.uint8(255)))
+    matcher = prepared(arm, tiny.region)
+    assert matcher.match(replace(query, evidence=sure), top_k=5) == matcher.match(query, top_k=5)
 
 
 def test_an_answer_tells_its_evidence_and_protection_levels(tiny, whole, drawn):

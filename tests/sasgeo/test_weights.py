@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.sasgeo.rates import ClassRates
 from sasgeo_bench.sasgeo.weights import information, likelihood_gains, weigh
 
@@ -49,7 +50,8 @@ def test_the_linear_form_sums_the_gains_cell_by_cell(seed):
     rng = np.random.default_rng(seed)
     seen, mapped = rng.integers(0, 3, (2, 5, 7), dtype=np.uint8), rng.integers(0, 2, (2, 5, 7), dtype=np.uint8)
     gains = likelihood_gains([HOUSE, replace(HOUSE, hit=0.6)], age_years=3.0)
-    weights, known = weigh(seen, gains)
+    view = Evidence(classes=("building", "water"), cells=seen, cell_size_m=1.0)
+    weights, known = weigh(view.levels(), gains)
     linear = float((weights * mapped).sum() + known.sum())
     table = {(1, 1): gains.agree, (1, 0): gains.extra, (0, 1): gains.missed, (0, 0): gains.quiet}
     by_hand = sum(
@@ -59,3 +61,38 @@ def test_the_linear_form_sums_the_gains_cell_by_cell(seed):
         if z < 2
     )
     assert linear == pytest.approx(by_hand, abs=1e-3)
+
+
+@pytest.mark.parametrize("chance", [0.0, 0.1, 0.5, 0.9, 1.0])
+def test_a_cell_with_a_probability_has_the_logarithm_of_its_expected_likelihood_ratio(chance):
+    gains = likelihood_gains([HOUSE], age_years=3.0)
+    view = Evidence.of_probabilities(("building",), np.array([[[chance]]]), cell_size_m=1.0)
+    weights, known = weigh(view.levels(), gains)
+    kept = view.probabilities()[0, 0, 0]
+    agree, extra, missed, quiet = (
+        float(np.exp(part[0])) for part in (gains.agree, gains.extra, gains.missed, gains.quiet)
+    )
+    mapped, empty = kept * agree + (1 - kept) * missed, kept * extra + (1 - kept) * quiet
+    assert known[0, 0] == pytest.approx(np.log(empty), abs=1e-6)
+    assert weights[0, 0, 0] + known[0, 0] == pytest.approx(np.log(mapped), abs=1e-6)
+
+
+def test_certain_cells_weigh_the_same_with_confidence_and_without_to_the_last_bit():
+    cells = np.random.default_rng(0).integers(0, 3, (2, 9, 9), dtype=np.uint8)
+    plain = Evidence(classes=("building", "water"), cells=cells, cell_size_m=1.0)
+    sure = plain.replace(plain.cells, np.where(cells < 2, np.uint8(255), np.uint8(0)))
+    gains = likelihood_gains([HOUSE, replace(HOUSE, hit=0.6)], age_years=3.0)
+    for one, other in zip(weigh(plain.levels(), gains), weigh(sure.levels(), gains), strict=True):
+        assert (one == other).all()
+    only = float(weigh(np.array([[[510]]], dtype=np.uint16), gains.only(0))[0][0, 0, 0])
+    assert only == np.float32(gains.agree[0] - gains.extra[0])
+
+
+def test_a_probability_that_is_the_share_of_seen_cells_says_nothing():
+    gains = likelihood_gains([HOUSE], age_years=0.0)
+    share = HOUSE.mapped * HOUSE.hit + (1 - HOUSE.mapped) * (0.01 * HOUSE.hit + 0.99 * HOUSE.false_alarm)
+    chances = np.array([[[share, share / 3, 3 * share]]])
+    weights = weigh(Evidence.of_probabilities(("building",), chances, cell_size_m=1.0).levels(), gains)[0][0, 0]
+    assert abs(weights[0]) < 0.02  # a step of probability
+    assert weights[1] < -0.3
+    assert weights[2] > 0.3

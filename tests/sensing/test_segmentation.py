@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from sasgeo_bench.core.errors import ImageError
-from sasgeo_bench.sensing.segmentation import SILENT, Segmentation
+from sasgeo_bench.sensing.segmentation import CERTAIN, SILENT, Segmentation, calibration_tables
 
 PLANES = arrays(np.uint8, array_shapes(min_dims=3, max_dims=3, max_side=6))
 
@@ -124,3 +124,26 @@ SOUND = {"classes": ["a"], "shape": [2, 2]}
 def test_bytes_that_are_none_of_a_picture_are_refused_in_one_line(data: bytes, fault: str) -> None:
     with pytest.raises(ImageError, match=fault):
         Segmentation.from_bytes(data, shape=(2, 2))
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1.0, 0.0), (0.5, -1.0), (1.6, 0.8)])
+def test_calibration_finds_the_odds_that_pixels_were_drawn_with_and_keeps_their_order(
+    scale: float, shift: float
+) -> None:
+    said = (np.arange(SILENT) / CERTAIN).clip(1e-3, 1 - 1e-3)
+    true = 1 / (1 + np.exp(-(scale * np.log(said / (1 - said)) + shift)))
+    counts = np.zeros((2, 256), dtype=np.int64)
+    counts[:, :SILENT] = np.rint(40_000 * np.stack((1 - true, true)))
+    table = calibration_tables({"building": counts})["building"]
+    assert table[SILENT] == SILENT
+    assert (np.diff(table[:SILENT].astype(int)) >= 0).all()
+    inner = slice(10, 245)
+    assert np.abs(table[:SILENT][inner] / CERTAIN - true[inner]).max() < 0.01
+
+
+def test_calibration_leaves_out_a_class_of_which_one_label_is_missing_and_few_pixels_change_little() -> None:
+    few = np.zeros((2, 256), dtype=np.int64)
+    few[0, 127] = 9
+    assert calibration_tables({"water": few}) == {}
+    few[1, 127] = 1
+    assert abs(int(calibration_tables({"water": few})["water"][127]) - 127) < 5

@@ -37,7 +37,7 @@ class GridMarkov(GridFilter):
 
     card = sgb.MatcherCard(
         name="grid_markov",
-        version="2",
+        version="3",
         title="Histogram filter over place and heading",
         source=SOURCE,
         ours=f"Diffusion by the covariance of each increment, which the released code leaves out. {OURS}",
@@ -71,7 +71,7 @@ class GridMarkovStill(GridMarkov):
 
     card = sgb.MatcherCard(
         name="grid_markov_still",
-        version="2",
+        version="3",
         title="Histogram filter over place and heading, without diffusion",
         source=f"{SOURCE}; without diffusion, as its released code",
         ours=OURS,

@@ -78,9 +78,9 @@ class DenseMatcher(ABC):
         self._chart = self.read(region)
         self._used = self._chart.used()
 
-    def seen(self, cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the cells of a view as this matcher reads them."""
-        return cells
+    def seen(self, evidence: Evidence) -> Evidence:
+        """Return a view as this matcher reads it."""
+        return evidence
 
     def rescored(self, modes: list[Mode], check: PoseCheck) -> list[Mode]:
         """Return the modes of a search, in their order, with the scores that rank them."""
@@ -124,11 +124,13 @@ class DenseMatcher(ABC):
 
     def _read(self, evidence: Evidence, chart: Chart) -> Evidence:
         shared = [index for index, name in enumerate(evidence.classes) if name in chart.classes]
-        return Evidence(
-            classes=tuple(evidence.classes[index] for index in shared),
-            cells=self.seen(evidence.cells[shared]),
-            cell_size_m=evidence.cell_size_m,
-            confidence=None if evidence.confidence is None else evidence.confidence[shared],
+        return self.seen(
+            Evidence(
+                classes=tuple(evidence.classes[index] for index in shared),
+                cells=evidence.cells[shared],
+                cell_size_m=evidence.cell_size_m,
+                confidence=None if evidence.confidence is None else evidence.confidence[shared],
+            )
         )
 
     def _view(self, seen: Evidence, chart: Chart) -> View:
@@ -148,13 +150,14 @@ class FftVote(DenseMatcher):
 
     card = MatcherCard(
         name="fft_vote",
-        version="3",
+        version="4",
         title="Exhaustive three-state voting by FFT",
         source="Template voting of OrienterNet (Sarlin et al., CVPR 2023), on the scores of the SASGeo paper, Eqs. 7-8",
         ours=(
-            "One vote a class and cell in place of learned features; division by the cells known on both sides; "
-            "scale; half of the view must be on the map; modes by their mean votes in place of a softmax and a "
-            "covariance; coarse cells of 4 m (8 m beyond 5 km2), then local search"
+            "One vote a class and cell, by its probability if the view has some, in place of learned features; "
+            "division by the cells known on both sides; scale; half of the view must be on the map; modes by their "
+            "mean votes in place of a softmax and a covariance; coarse cells of 4 m (8 m beyond 5 km2), then local "
+            "search"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
@@ -171,4 +174,5 @@ class FftVote(DenseMatcher):
 
     def template(self, evidence: Evidence) -> NDArray[np.float64]:
         """Return the template with gains of 1."""
-        return make_template(evidence.cells, VoteGains.uniform(len(evidence.classes)))
+        gains = VoteGains.uniform(len(evidence.classes))
+        return make_template(evidence.cells, gains, chances=evidence.probabilities())

@@ -29,13 +29,16 @@ import shapely
 import torch
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
-from sasgeo_baselines.segmenters.osm_unet import CLASSES, WEIGHTS, normalized
+from sasgeo_baselines.segmenters.osm_unet import CLASSES, WEIGHTS, OsmUNet, normalized
 from torch import nn
 from torch.nn import functional
 
 import sasgeo_bench as sgb
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.scoring.segmentation import PixelCounts
 from sasgeo_bench.sensing.crops import Crop, drawn_crops, real_crops
+from sasgeo_bench.sensing.reference_imagery import region_views
+from sasgeo_bench.sensing.segmentation import SILENT, calibration_of
 
 WIDTHS: Final = (24, 40, 64, 96, 128)  # channels at cells of 1, 2, 4, 8 and 16 m
 SIDE_PX: Final = 256
@@ -58,7 +61,8 @@ DRAWN: Final = (
     *("hanoi", "hcmc", "kathmandu", "malabo", "moron", "pontadelgada", "porto", "rzeszow", "sanmartinorio", "saopaulo"),
     "trento",
 )
-REAL: Final = ("pardubice-ortho:0,1,0,0.8", "banepa")  # the south of Pardubice is kept back
+REAL: Final = ("pardubice-ortho:0,1,0,0.8", "banepa")
+HELD: Final = "pardubice-ortho:0,1,0.8,1"  # the south of Pardubice is kept back
 
 Pixels = NDArray[np.uint8]
 Planes = NDArray[np.float32]
@@ -222,6 +226,21 @@ def loss_of(found: torch.Tensor, wanted: torch.Tensor, weights: torch.Tensor) ->
     return (each.sum(dim=(0, 2, 3)) / weights.sum(dim=(0, 2, 3)).clamp(min=LEAST_CELLS)).sum()
 
 
+def calibrate(net: Net, weights: Path, region: sgb.Region, box: Sequence[float]) -> None:
+    """Scale and shift the log-odds of each class by labelled pixels of a picture that taught nothing (Platt 1999)."""
+    segmenter = OsmUNet(weights)
+    views = region_views(region, part_of(region, box), place=region.manifest.id, gsd_m=PIXEL_M, side_px=2 * SIDE_PX)
+    counts = [PixelCounts.of(view, segmenter.segment(view.image, learned=None), image="") for view in views]
+    for number, name in enumerate(CLASSES):
+        pixels = sum(one.of_class(name) for one in counts if name in one.classes)
+        if not isinstance(pixels, int) and pixels[:, :SILENT].any(axis=1).all():
+            scale, shift = calibration_of(pixels)
+            print(f"{name}: log-odds times {scale:.2f}, {shift:+.2f}")
+            with torch.no_grad():
+                net.head.weight[number] *= scale
+                net.head.bias[number] = net.head.bias[number] * scale + shift
+
+
 def export(net: Net, path: Path) -> None:
     """Write a network as ONNX with its larger arrays in half precision, which OpenCV reads."""
     net.eval()
@@ -302,6 +321,7 @@ def main() -> None:
         "--real", nargs="*", default=REAL, help="regions with pictures: NAME, or NAME:WEST,EAST,NORTH,SOUTH"
     )
     parser.add_argument("--drawn-share", type=float, default=0.5, help="of all crops")
+    parser.add_argument("--calibrate", default=HELD, help="part of a picture that taught nothing; empty: none")
     parser.add_argument("--steps", type=int, default=5000, help=f"rounded up to parts of {PART}")
     parser.add_argument("--batch", type=int, default=4, help="crops of a step")
     parser.add_argument("--rate", type=float, default=2e-3, help="of learning, at its highest")
@@ -312,10 +332,15 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     sources = sources_of(options.drawn, options.real, options.drawn_share, options.out)
     net = train(sources, folder / f"{options.name}.pt", options)
-    export(net, folder / f"{options.name}.onnx")
-    print(f"{folder / options.name}.onnx: {(folder / f'{options.name}.onnx').stat().st_size / 1e6:.2f} MB")
+    weights = folder / f"{options.name}.onnx"
+    export(net, weights)
+    if options.calibrate:
+        name, _, box = options.calibrate.partition(":")
+        calibrate(net, weights, region_of(name, options.out), tuple(map(float, box.split(","))))
+        export(net, weights)
+    print(f"{weights}: {weights.stat().st_size / 1e6:.2f} MB")
     if options.ship:
-        shutil.copyfile(folder / f"{options.name}.onnx", WEIGHTS)
+        shutil.copyfile(weights, WEIGHTS)
 
 
 def region_of(name: str, out: Path) -> sgb.Region:

@@ -200,8 +200,7 @@ def _shifted_bytes(counts: NDArray[np.int64], share: float) -> NDArray[np.uint8]
         return same
     if share in (0, 1):
         return np.where(same == SILENT, SILENT, round(share * CERTAIN)).astype(np.uint8)
-    # The outer bytes stand for half a step each: their odds are finite, so a share can always be met.
-    log_odds = logit(np.clip(np.arange(SILENT) * _STEP, _STEP / 4, 1 - _STEP / 4))
+    log_odds = _byte_log_odds()
     share = min(max(share, _LEAST_SHARE), 1 - _LEAST_SHARE)
     weights = counts / counts.sum()
     shift = brentq(lambda by: float(weights @ expit(log_odds + by)) - share, -_MOST_SHIFT, _MOST_SHIFT)
@@ -237,14 +236,25 @@ def calibration_tables(counts: Mapping[str, NDArray[np.integer]]) -> dict[str, N
     >>> calibration_tables({"building": counts})["building"][[127, 255]].tolist()
     [26, 255]
     """
-    told = {name: pixels[:, :SILENT] for name, pixels in counts.items()}
-    return {name: _calibrated_bytes(pixels) for name, pixels in told.items() if pixels.any(axis=1).all()}
+    tables = {}
+    for name, pixels in counts.items():
+        if pixels[:, :SILENT].any(axis=1).all():
+            scale, shift = calibration_of(pixels)
+            tables[name] = np.arange(SILENT + 1, dtype=np.uint8)
+            tables[name][:SILENT] = np.floor(expit(scale * _byte_log_odds() + shift) * CERTAIN + 0.5)
+    return tables
 
 
-def _calibrated_bytes(pixels: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """Return the new byte of every byte, shape (256,), from pixels by label and byte, shape (2, 255)."""
-    log_odds = logit(np.clip(np.arange(SILENT) * _STEP, _STEP / 4, 1 - _STEP / 4))
-    absent, present = pixels / _PIXELS_EACH
+def calibration_of(pixels: NDArray[np.integer]) -> tuple[float, float]:
+    """Return scale and shift of the log-odds of one class, from its pixels, shape (2, 256), as `calibration_tables`.
+
+    >>> counts = np.zeros((2, 256), dtype=np.int64)
+    >>> counts[:, 127] = 90_000, 10_000
+    >>> [round(number, 1) for number in calibration_of(counts)]
+    [1.0, -2.2]
+    """
+    log_odds = _byte_log_odds()
+    absent, present = pixels[:, :SILENT] / _PIXELS_EACH
 
     def loss(vector: NDArray[np.float64]) -> float:
         """Return the negative log posterior of the logarithm of the scale, and of the shift."""
@@ -252,9 +262,15 @@ def _calibrated_bytes(pixels: NDArray[np.integer]) -> NDArray[np.uint8]:
         return float(present @ np.logaddexp(0, -changed) + absent @ np.logaddexp(0, changed) + 0.5 * vector @ vector)
 
     scale, shift = minimize(loss, np.zeros(2), method="L-BFGS-B", bounds=[(-3.0, 3.0), (-_MOST_SHIFT, _MOST_SHIFT)]).x
-    same = np.arange(SILENT + 1, dtype=np.uint8)
-    same[:SILENT] = np.floor(expit(np.exp(scale) * log_odds + shift) * CERTAIN + 0.5)
-    return same
+    return float(np.exp(scale)), float(shift)
+
+
+def _byte_log_odds() -> NDArray[np.float64]:
+    """Return the log-odds of every byte, shape (255,).
+
+    The outer bytes stand for half a step each: their odds are finite, so a share can always be met.
+    """
+    return np.asarray(logit(np.clip(np.arange(SILENT) * _STEP, _STEP / 4, 1 - _STEP / 4)))
 
 
 def _read_head(head: Mapping[str, object]) -> tuple[tuple[str, ...], tuple[int, int]]:

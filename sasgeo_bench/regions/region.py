@@ -246,6 +246,10 @@ class Region:
         }
         return html_facts(f"{about.title} ({about.id})", facts)
 
+    def within(self, area: shapely.Geometry) -> "Region":
+        """Return the region with no mapped ground beyond an area in its CRS; its layers stay what they are, unread."""
+        return Region(**vars(self) | {"coverage": self.coverage.intersection(area)})
+
     def layer(self, class_name: str) -> NDArray[np.uint8]:
         """Return the raster of one class, shape (rows, cols); no other is read, for a country's take a gigabyte."""
         at = self.classes.index(class_name)

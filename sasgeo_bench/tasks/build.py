@@ -29,6 +29,7 @@ from sasgeo_bench.tasks.edited_maps import changed_maps, degraded_map, edit_maps
 from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer
 from sasgeo_bench.tasks.frames import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
+from sasgeo_bench.tasks.pictured_ground import PicturedGround
 from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
@@ -36,11 +37,11 @@ from sasgeo_bench.tasks.split import Block, Split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.ages import ageing_of
 from sasgeo_bench.tasks.suites.all_suites import suite_code
-from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, Suite, no_larger
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, Suite
 from sasgeo_bench.tasks.suites.flights import FlightSuite
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.task_files import Task, TaskOrigin, TruthManifest
-from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate
+from sasgeo_bench.tasks.task_plan import Request, check_count, check_roots, check_separate, older_dates
 
 _SKIP: Final = " (--skip passes on to the next suite)"
 
@@ -164,7 +165,7 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
     Raise `ConfigError` if the region cannot carry the suite or so many sites.
     """
     suite = request.found
-    suite = replace(suite, variants=no_larger(suite.variants, request.region.largest_view_m))
+    suite = replace(suite, variants=suite.fitting(request.region.largest_view_m))
     refusal = None if request.group is None else suite.refusal(request.group)
     if refusal is not None:
         raise ConfigError(f"suite {suite.card.name!r} {refusal}")
@@ -176,7 +177,8 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
     seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name, str(suite.card.version)))
     suite = replace(suite, variants=suite.usable(scene))
     if isinstance(suite, FlightSuite):
-        airspace = Airspace(region=base, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group)
+        over = base if scene.pictured is None else base.within(scene.pictured.footprint)
+        airspace = Airspace(region=over, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group)
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
         airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))
         pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice)
@@ -209,14 +211,12 @@ def read_scene(request: Request, suite: Suite) -> tuple[Scene, Region]:
         raise ConfigError(f"split {request.split.spec.id!r} does not speak of region {request.region.id!r}")
     state = State.of(base, bits=read_bits(folder / region_files.LAYERS))
     needs = suite.card.needs
-    others: tuple[State, ...] = ()
     elsewhere: State | None = None
-    imagery = base.imagery if base.imagery is not None and not base.imagery.record.is_rendered else None
-    if "degraded map" in needs and imagery is not None:
-        others = (degraded_map(request, suite, base),)
-    if "older maps" in needs:
-        folders = [_built(request, request.region, date) for date in aged_dates(request.region)]
-        others = tuple(map(State.read, folders))
+    pictured = _pictured(base, state) if "imagery" in needs else None
+    older = () if "imagery" in needs and pictured is None else older_dates(request.region, needs)
+    others = tuple(State.read(_built(request, request.region, date)) for date in older)
+    if "degraded map" in needs and pictured is not None:
+        others = (degraded_map(request, suite, base), *others)
     if "another region" in needs and request.elsewhere is not None:
         # A view that shows more than the region's map knows of would give away that it is of another place.
         elsewhere = State.read(_built(request, request.elsewhere, None)).of_classes(base.classes)
@@ -228,7 +228,8 @@ def read_scene(request: Request, suite: Suite) -> tuple[Scene, Region]:
         scenes=base.manifest.scenes,
         others=others,
         elsewhere=elsewhere,
-        imagery=imagery if "imagery" in needs else None,
+        pictured=pictured,
+        pictured_elsewhere=_pictured_elsewhere(request) if "another picture" in needs and pictured else None,
         ageing=_ageing(request.region, request.split) if "rates of ageing" in needs else None,
         looks={block.id: look_of(request.split, block) for block in blocks} if suite.is_pictured else {},
         profile=request.choice.profile,
@@ -237,6 +238,21 @@ def read_scene(request: Request, suite: Suite) -> tuple[Scene, Region]:
         seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name))
         scene = replace(scene, natural=suite.mine(scene, request.group, seeds))
     return scene, base
+
+
+def _pictured(base: Region, state: State) -> PicturedGround | None:
+    """Return a map with the imagery of its region; None where there is none, or none of photographs."""
+    imagery = base.imagery
+    return None if imagery is None or imagery.record.is_rendered else PicturedGround(state=state, imagery=imagery)
+
+
+def _pictured_elsewhere(request: Request) -> PicturedGround | None:
+    if request.elsewhere is None:
+        return None
+    folder = _built(request, request.elsewhere, None)
+    there = region_files.read_region(folder, with_layers=False)
+    state = State.of(there, bits=read_bits(folder / region_files.LAYERS))
+    return _pictured(there, state.of_classes(request.region.class_names))
 
 
 def look_of(split: Split, block: Block) -> Family:

@@ -143,7 +143,7 @@ class Airspace:
                     views = self._views(kind, length_m, spacing_m, rng)
                     if views is None:
                         break
-                    if not self._is_in_one_part(views):
+                    if not (self._is_in_one_part(views) and self._is_shown(views, scale)):
                         continue
                     plot = self._plot(views, before, rng)
                     if (plot is None) == isinstance(self.suite, ChangedMapSuite) or not self._is_drawn(views, scale):
@@ -203,6 +203,10 @@ class Airspace:
             for at in zip(*views.position_m[:, :2].T.tolist(), strict=True)
         }
         return len(parts) == 1 and None not in parts
+
+    def _is_shown(self, views: Trajectory, scale: float) -> bool:
+        poses = (pose_of(views, frame, scale) for frame in range(len(views)))
+        return all(self.suite.ground_at(self.scene, pose) is not None for pose in poses)
 
     def _block(self, views: Trajectory) -> str:
         middle = pose_of(views, len(views) // 2, 1.0)

@@ -194,7 +194,7 @@ class Drawer:
             candidate=right,
             pair_id=self._site_seeds(site).digest("pair", job.track).hex()[:16],
             role=variant.role,
-            kind=kind_of(variant.role, variant.kind, draft.measured),
+            kind=kind_of(variant.role, draft.kind or variant.kind, draft.measured),
             strength=variant.strength if draft.strength is None else draft.strength,
             strength_unit=self.suite.card.strength_unit,
             unknown_share=draft.evidence.unknown_share,

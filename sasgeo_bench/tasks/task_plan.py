@@ -20,7 +20,7 @@ from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.split import Split, find_split_file, list_split_files, make_split, read_split_file
 from sasgeo_bench.tasks.suites.ages import AGES_YEARS, DAYS_PER_YEAR
 from sasgeo_bench.tasks.suites.all_suites import find_suite
-from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Suite
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Need, Suite
 
 PRIVATE_ROOT: Final = "private"  # below the root of public queries, so that no folder holds both
 
@@ -65,15 +65,21 @@ class Request(Settings):
     def most(self) -> int:
         """Return how many queries, or flights, are drawn at most: a region may hold fewer sites."""
         suite = self.found
-        taken = [self.choice.takes(variant, track) for variant in suite.variants for track in suite.tracks(variant)]
+        older = len(older_dates(self.region, suite.card.needs))
+        taken = [
+            suite.drawn_of(variant, older) * self.choice.takes(variant, track)
+            for variant in suite.variants
+            for track in suite.tracks(variant)
+        ]
         return self.count * sum(taken) * len(suite.drawn_by(self.choice.detectors))
 
     @property
     def extracts(self) -> tuple[Extract, ...]:
         """Return the extracts of all maps that the queries are drawn from."""
         needs = self.found.card.needs
-        dates = aged_dates(self.region) if "older maps" in needs else ()
-        others = [self.elsewhere.pick(None)] if "another region" in needs and self.elsewhere is not None else []
+        dates = older_dates(self.region, needs)
+        is_asked = "another region" in needs or "another picture" in needs
+        others = [self.elsewhere.pick(None)] if is_asked and self.elsewhere is not None else []
         return (*map(self.region.pick, (None, *dates)), *others)
 
 
@@ -132,7 +138,7 @@ def plan_requests(wanted: TaskRequest) -> tuple[Request, ...]:
             suite_spec=spec,
             region=item,
             split=split,
-            elsewhere=wrong_place(split, item, known),
+            elsewhere=wrong_place(split, item, known, is_pictured="another picture" in suite.card.needs),
             **settings | ({"seed": wanted.sealed_seed} if split.sealed_place(item.id) else {}),
         )
         for item in _without_sealed({item.id: item for item in named}, split, wanted)
@@ -199,7 +205,9 @@ def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -
     return True
 
 
-def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile]) -> RegionFile | None:
+def wrong_place(
+    split: Split, region: RegionFile, known: Mapping[str, RegionFile], *, is_pictured: bool = False
+) -> RegionFile | None:
     """Return the region for views of a wrong place: the next place of the split of the same kind, synthetic or real.
 
     Its map knows of all classes that the region's knows of; beside a region that knows of few, a town will do where no
@@ -207,6 +215,9 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
     It depends on the split alone, so that asking for more regions changes no query. In a hold-out it is of the same
     part, so that none learns from views of a test place; and of another country, whose places calibrate others. No
     view is of a sealed place.
+
+    With `is_pictured` it is a region with imagery. Few places have some: in a hold-out where no other of the same part
+    has, it is of a train place, from whose pictures anybody may learn.
     """
     places = split.spec.place
     at = next((index for index, place in enumerate(places) if region.id in place.region_ids), None)
@@ -214,12 +225,16 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
         return None
     own = split.spec.place[at]
     others = [split.spec.place[(at + step) % len(places)] for step in range(1, len(places))]
+    allowed = [item for item in others if not item.sealed and not (own.country and item.country == own.country)]
+    parts = (own.part, "train") if is_pictured else (own.part,)
     fitting = [
         known[name]
-        for place in others
-        if not place.sealed and place.part == own.part and not (own.country and place.country == own.country)
+        for part in dict.fromkeys(parts)
+        for place in allowed
+        if place.part == part
         for name in place.region_ids
         if name in known and set(region.class_names) <= set(known[name].class_names)
+        if known[name].imagery or not is_pictured
     ]
     alike = [one for one in fitting if _is_town(one) == _is_town(region)]
     if not alike and region.classes is not None:
@@ -229,6 +244,14 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
 
 def _is_town(region: RegionFile) -> bool:
     return region.pick(None).town is not None
+
+
+def older_dates(spec: RegionFile, needs: Sequence[Need]) -> tuple[dt.date, ...]:
+    """Return the dates of the older maps of a region that a suite with these needs searches, oldest first."""
+    if "every older map" in needs:
+        newest = spec.pick(None).date
+        return tuple(sorted(extract.date for extract in spec.extract if extract.date < newest))
+    return aged_dates(spec) if "older maps" in needs else ()
 
 
 def aged_dates(spec: RegionFile) -> tuple[dt.date, ...]:

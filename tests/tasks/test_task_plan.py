@@ -14,7 +14,15 @@ from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.suites.ages import AGES_YEARS, DAYS_PER_YEAR
-from sasgeo_bench.tasks.task_plan import TaskRequest, aged_dates, check_count, check_roots, plan_requests, wrong_place
+from sasgeo_bench.tasks.task_plan import (
+    TaskRequest,
+    aged_dates,
+    check_count,
+    check_roots,
+    older_dates,
+    plan_requests,
+    wrong_place,
+)
 
 RIVERSIDE = "town-riverside"
 
@@ -175,6 +183,45 @@ def test_a_wrong_place_does_not_depend_on_what_else_is_asked_for(tmp_path):
 def test_without_a_second_place_of_its_kind_a_region_has_no_wrong_place(tmp_path):
     split = own_split(tmp_path, RIVERSIDE, "vaduz")
     assert plan(tmp_path, split=str(split))[0].elsewhere is None
+
+
+def pictured(known, *names):
+    """Region files of which the named ones have imagery."""
+    entry = next(item.imagery for item in known.values() if item.imagery)
+    return {name: item.model_copy(update={"imagery": entry if name in names else []}) for name, item in known.items()}
+
+
+@pytest.mark.parametrize(
+    ("region", "with_pictures", "expected"),
+    [
+        ("vaduz", ("porto", "munich"), "munich"),  # of the same part
+        ("vaduz", ("porto",), "porto"),  # or of a train place, from whose pictures anybody learns
+        ("porto", ("munich",), None),  # but none learns from a test place
+        ("munich", ("lauf", "porto"), "porto"),  # nor is a place of the same country another one
+        ("vaduz", (), None),
+    ],
+)
+def test_a_wrong_picture_is_of_the_same_part_or_a_train_place(region, with_pictures, expected, known, tmp_path):
+    places = (("vaduz", "test", "li"), ("munich", "test", "de"), ("lauf", "test", "de"), ("porto", "train", "pt"))
+    lines = ['id = "mine"\ntitle = "Mine"\nkind = "holdout"\nbuffer_m = 0.0']
+    lines += [
+        f'[[place]]\nname = "{name}"\nregions = ["{name}"]\npart = "{part}"\ncountry = "{country}"'
+        for name, part, country in places
+    ]
+    (tmp_path / "mine.toml").write_text("\n".join(lines) + "\n")
+    split = make_split(read_split_file(tmp_path / "mine.toml"), {name: item.grid() for name, item in known.items()})
+    files = pictured(known, *with_pictures)
+    other = wrong_place(split, files[region], files, is_pictured=True)
+    assert (other and other.id) == expected
+
+
+def test_a_suite_searches_the_older_maps_of_fitting_age_or_every_one():
+    vaduz = read_region_file(find_region_file("vaduz"))
+    newest = max(extract.date for extract in vaduz.extract)
+    every = older_dates(vaduz, ("imagery", "every older map"))
+    assert every == tuple(sorted(extract.date for extract in vaduz.extract if extract.date != newest))
+    assert older_dates(vaduz, ("older maps",)) == aged_dates(vaduz) != every
+    assert older_dates(vaduz, ("imagery",)) == ()
 
 
 @given(st.lists(st.dates(dt.date(2005, 1, 1), dt.date(2026, 1, 1)), min_size=1, max_size=12, unique=True))

@@ -8,7 +8,7 @@ from sasgeo_bench.core.errors import ConfigError, MatchError
 from sasgeo_bench.core.plugins import SUITES as GROUP
 from sasgeo_bench.core.plugins import check_own_name, find_inside, list_entry_points, made, plugin_code
 from sasgeo_bench.tasks.query import BY
-from sasgeo_bench.tasks.suites import ages, board_controls, flights, natural, pictures, twins, views
+from sasgeo_bench.tasks.suites import ages, board_controls, flights, natural, pictures, real_image, twins, views
 from sasgeo_bench.tasks.suites.base import Suite
 from sasgeo_bench.tasks.suites.flights import FlightSuite
 
@@ -46,7 +46,7 @@ PICTURE_SUITES: Final[dict[str, Suite]] = {
         pictures.LIGHT,
         pictures.SEASON_IMAGE,
         pictures.ACCUMULATED,
-        pictures.REAL_IMAGE,
+        real_image.REAL_IMAGE,
     )
 }
 # Queries of these are the views of a flight in order; they are drawn where they are named.
@@ -62,6 +62,7 @@ FLIGHT_SUITES: Final[dict[str, FlightSuite]] = {
         flights.FLIGHT_ALIAS,
         flights.FLIGHT_OFF_MAP,
         flights.FLIGHT_IMAGE,
+        real_image.FLIGHT_REAL_IMAGE,
     )
 }
 # With the controls, which every board draws in addition to its experiment.

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.regions.imagery import Imagery
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.perturbations.perception import NO_PROFILE, perception_of
 from sasgeo_bench.tasks.perturbations.perception_profile import PerceptionProfile
+from sasgeo_bench.tasks.pictured_ground import PicturedGround
 from sasgeo_bench.tasks.private_seed import Seed
 from sasgeo_bench.tasks.query import PERCEIVED, PROFILE, PUBLISHED, Detector, PriorGroup, Role, Track
 from sasgeo_bench.tasks.split import Block
@@ -31,7 +31,16 @@ if TYPE_CHECKING:
 MAIN_VIEW_CELLS: Final = 192
 VIEW_CELLS: Final = (96, 192, 384)
 ANCHOR_SPREAD: Final = 0.2  # largest distance of a site from its anchor, as a fraction of the view's side
-Need = Literal["older maps", "another region", "rates of ageing", "imagery", "degraded map", "natural twins"]
+Need = Literal[
+    "older maps",
+    "every older map",
+    "another region",
+    "another picture",
+    "rates of ageing",
+    "imagery",
+    "degraded map",
+    "natural twins",
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,12 +73,12 @@ class NaturalTwin:
 class Scene:
     """The map to search, the world to see, and everything else that a suite draws from.
 
-    `view_reach_m` is the largest distance that a view shows from its centre. `others` are states at other dates, oldest
-    first, or a degraded one; `elsewhere` is another place; `imagery` is that of the region; `scenes` are its tags;
-    `twins` are the places that look like each site; `ageing` has the rates of other places; `looks` are the families of
-    palettes and materials of pictures, by block, and `painted` the last windows that were painted; `profile` has the
-    errors of the detector "profile". `natural` has the pairs of places of the map that look alike, `look_alikes` for
-    each site its twin elsewhere.
+    `view_reach_m` is the largest distance that a view shows from its centre. `others` are a degraded state and states
+    at other dates, oldest first; `elsewhere` is another place; `pictured` is the map with the imagery of the region,
+    `pictured_elsewhere` that of another place; `scenes` are its tags; `twins` are the places that look like each site;
+    `ageing` has the rates of other places; `looks` are the families of palettes and materials of pictures, by block,
+    and `painted` the last windows that were painted; `profile` has the errors of the detector "profile". `natural` has
+    the pairs of places of the map that look alike, `look_alikes` for each site its twin elsewhere.
     """
 
     map: State
@@ -79,7 +88,8 @@ class Scene:
     scenes: tuple[str, ...]
     others: tuple[State, ...] = ()
     elsewhere: State | None = None
-    imagery: Imagery | None = None
+    pictured: PicturedGround | None = None
+    pictured_elsewhere: PicturedGround | None = None
     twins: Mapping[int, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     ageing: Ageing | None = None
     looks: Mapping[str, Family] = field(default_factory=dict)
@@ -95,7 +105,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """One query to draw at every site."""
+    """One query to draw at every site; `radius_m` is that of its disc, where it has one of its own."""
 
     role: Role
     kind: str
@@ -103,12 +113,14 @@ class Variant:
     view_cells: int = MAIN_VIEW_CELLS
     cell_size_m: float = 1.0
     detector: Detector = PUBLISHED
+    radius_m: float | None = None
 
     @property
     def name(self) -> str:
         """Return the name within the suite, part of the seed of a query's id."""
         plain = f"{self.role}/{self.kind}/{self.strength:g}/{self.view_cells}/{self.cell_size_m:g}"
-        return "/".join((plain, *self.others))
+        disc = () if self.radius_m is None else (f"r{self.radius_m:g}",)
+        return "/".join((plain, *disc, *self.others))
 
     @property
     def others(self) -> tuple[str, ...]:
@@ -202,7 +214,8 @@ class QueryDraft:
     if it was not taken in this map. For retrieval, `is_removed` removes the true place from the candidates,
     `neighbours_m` replaces each candidate by a cluster of places, and `has_twins` adds the site's twins. `away_m` is
     the least distance from the truth to the rim of a searched disc that excludes it. `around_m` is the place that the
-    disc holds, if not the truth, and `omits_m` are places that it must not hold. `group` overrides the prior group.
+    disc holds, if not the truth, and `omits_m` are places that it must not hold. `group` overrides the prior group,
+    `kind` that of the variant.
     `density` is that of the seen place, if that is not the site; `strength` is that of the stress, if the place and not
     the variant sets it. `frames` are pictures with what is believed of their
     cameras, `labels` what is on them; their evidence is all unknown until a segmenter has seen them.
@@ -220,6 +233,7 @@ class QueryDraft:
     around_m: tuple[float, float] | None = None
     omits_m: tuple[tuple[float, float], ...] = ()
     group: PriorGroup | None = None
+    kind: str = ""
     density: float | None = None
     season: str = ""
     changed_share: float | None = None
@@ -299,9 +313,17 @@ class Suite(ABC):
         """Return why a prior group of the user does not fit this suite, or None."""
         return "is about what is known before: leave --prior out" if self.card.has_own_priors else None
 
+    def fitting(self, largest_m: float | None) -> tuple[Variant, ...]:
+        """Return the variants on a region that allows views of a side; None is no limit."""
+        return no_larger(self.variants, largest_m)
+
     def usable(self, scene: Scene) -> tuple[Variant, ...]:  # noqa: ARG002
         """Return the variants that the scene allows."""
         return self.variants
+
+    def drawn_of(self, variant: Variant, older: int) -> int:  # noqa: ARG002
+        """Return how many queries a variant is at a site of a region with so many older maps."""
+        return 1
 
     def map_region(self, scene: Scene, variant: Variant) -> str:  # noqa: ARG002
         """Return the name of the map that a variant's queries search."""
@@ -342,6 +364,15 @@ class Suite(ABC):
     def anchors(self, scene: Scene) -> NDArray[np.float64] | None:  # noqa: ARG002
         """Return places (easting, northing) that sites must be near, shape (N, 2); None for anywhere."""
         return None
+
+    @property
+    def grounds(self) -> tuple[str, ...]:
+        """Return the kinds of ground of which sites are chosen in turn."""
+        return ("",)
+
+    def ground_at(self, scene: Scene, pose: Pose) -> str | None:  # noqa: ARG002
+        """Return the kind of ground, of `grounds`, at what may be a site; None if it must not be one."""
+        return ""
 
     @property
     def anchor_spread_m(self) -> float:

@@ -44,7 +44,7 @@ class _Sums:
 def choose_sites(
     scene: Scene, suite: Suite, *, count: int, seeds: Seeds, group: PriorGroup, may_be_fewer: bool = False
 ) -> tuple[Site, ...]:
-    """Choose places for a suite, block by block in turn.
+    """Choose places for a suite, block by block in turn, and in each block by kinds of ground in turn.
 
     The result begins a sequence that does not depend on `count`: a larger count only adds sites. Centres keep the
     suite's spacing. `seeds` are those of region and suite; the scale sigma of `group` sets the spread of the views'
@@ -65,7 +65,9 @@ def choose_sites(
         group=group,
     )
     found: list[Site] = []
-    streams = [ground.sites(block, found) for block in scene.blocks]
+    kinds = suite.grounds
+    turns = ((at, block, turn) for turn in range(len(kinds)) for at, block in enumerate(scene.blocks))
+    streams = [ground.sites(block, kinds[(at + turn) % len(kinds)], found) for at, block, turn in turns]
     while streams and len(found) < count:
         for stream in list(streams):
             site = next(stream, None)
@@ -99,9 +101,9 @@ class _Ground:
     seeds: Seeds
     group: PriorGroup
 
-    def sites(self, block: Block, found: Sequence[Site]) -> Iterator[Site]:
-        """Draw sites of one block, none near those found so far in any block, until too many draws failed."""
-        rng = self.seeds.rng("block", block.row, block.col, "places")
+    def sites(self, block: Block, kind: str, found: Sequence[Site]) -> Iterator[Site]:
+        """Draw sites of one block on a kind of ground, none near those found so far, until too many draws failed."""
+        rng = self.seeds.rng("block", block.row, block.col, "places", *filter(None, (kind,)))
         west, south, east, north = block.bounds_m
         near = self._near(block)
         if near is not None and len(near) == 0:
@@ -113,11 +115,13 @@ class _Ground:
                 point = near[rng.integers(len(near))] + rng.uniform(-1, 1, 2) * spread_m
             place = (float(point[0]), float(point[1]))
             densities = self._densities(point) if block.holds(place) else None
-            if densities is None or min(densities) < self.suite.card.min_density or not self._is_free(place, found):
+            is_drawn = densities is not None and min(densities) >= self.suite.card.min_density
+            pose = self._pose(place) if is_drawn and self._is_free(place, found) else None
+            if densities is None or pose is None or self.suite.ground_at(self.scene, pose) != kind:
                 failed += 1
                 continue
             failed = 0
-            yield Site(index=len(found), pose=self._pose(place), block=block.id, density=densities[0])
+            yield Site(index=len(found), pose=pose, block=block.id, density=densities[0])
 
     def _near(self, block: Block) -> NDArray[np.float64] | None:
         if self.anchors is None:

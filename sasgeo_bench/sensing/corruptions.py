@@ -199,8 +199,9 @@ def _impulse_noise(rgb: Rgb, share: float, rng: np.random.Generator) -> Rgb:
     """Make a share of the picture black or white, pixel by pixel."""
 
     def hits(cells: Rgb) -> Rgb:
-        drawn, coin = rng.random((2, *cells.shape[:2], 1), dtype=np.float32)
-        return np.asarray((drawn < share) * np.where(coin < 0.5, -2, 2), dtype=np.float32)  # cut off behind it
+        drawn: Rgb = rng.random((*cells.shape[:2], 1), dtype=np.float32)
+        coin: Rgb = rng.random((*cells.shape[:2], 1), dtype=np.float32)
+        return np.where(drawn < share, np.where(coin < 0.5, -2, 2), 0).astype(np.float32)  # cut off behind it
 
     return _grainy(rgb, hits)
 
@@ -210,10 +211,10 @@ def _dead_lines(rgb: Rgb, share: float, rng: np.random.Generator) -> Rgb:
     found = rgb.copy()
     for lines in (found, found.transpose(1, 0, 2)):  # views of one picture
         count, length = lines.shape[:2]
-        is_dead, is_white, ends = rng.random(count) < share, rng.random(count) < 0.3, rng.random((count, 2))
-        for at in np.flatnonzero(is_dead):
-            first, last = np.sort(ends[at]) * (0.5, 0.5) + (0, 0.5)  # at least from one quarter to the next
-            lines[at, int(first * length) : int(last * length)] = float(is_white[at])
+        (drawn, coin), ends = rng.random((2, count)), np.sort(rng.random((count, 2)), axis=1)
+        for at in np.flatnonzero(drawn < share).tolist():
+            first, last = (ends[at] / 2 + (0, 0.5)).tolist()
+            lines[at, int(first * length) : int(last * length)] = float(coin[at] < 0.3)
     return found
 
 

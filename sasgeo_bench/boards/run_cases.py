@@ -132,7 +132,10 @@ def read_picture(case: Case, task: Task) -> CasePicture:
     row, col, rows, cols = window = _window(case, manifest.grid)
     layers, grid = read_layers(region / region_files.LAYERS, window=window), manifest.grid.window(row, col, rows, cols)
     bits = LayerBits.of(layers)
-    imagery = manifest.imagery if truth.detector == REAL else None  # that a real view was cut out of
+    owners = [manifest.attribution]
+    if truth.detector == REAL:  # cut out of imagery, perhaps of another place
+        of_map = "" if manifest.imagery is None else manifest.imagery.attribution
+        owners.append(task.manifest.picture_attribution or of_map)
     return CasePicture(
         title=_title(case),
         view=query.evidence,
@@ -144,7 +147,7 @@ def read_picture(case: Case, task: Task) -> CasePicture:
         at_answer=None if case.fix is None else seen_at(case.fix, query.evidence, bits, grid, manifest),
         disc=disc_of(query),
         lines=_lines(case),
-        attribution=manifest.attribution if imagery is None else f"{manifest.attribution}; {imagery.attribution}",
+        attribution="; ".join(filter(None, owners)),
         what=_what(case),
         region=query.region,
         picture=query.frames[-1].image().rgb if query.frames else None,

@@ -362,6 +362,9 @@ def _origin(
     manifest = region_files.read_manifest(request.out / "regions" / region)
     spec = request.split.spec
     texts = {name: getattr(card, name) for name in ("title", "what", "separates", "falsifier", "strength_unit")}
+    pictured = filter(None, (drawer.scene.pictured, drawer.scene.pictured_elsewhere))
+    owners = "; ".join(dict.fromkeys(item.imagery.record.attribution for item in pictured))
+    texts |= {"picture_attribution": owners} if owners else {}
     return TaskOrigin(
         suite=card.name,
         suite_version=card.version,

@@ -448,6 +448,7 @@ class TaskOrigin(Document):
     sealed_seed: dict[str, str | int] | None = None  # the same
     licence: str | None = None
     attribution: str | None = None
+    picture_attribution: str | None = None  # of all imagery that real pictures are cut out of
     segmenter: dict[str, str] | None = None  # what made the evidence of the pictures: name, version, hash
     failed_pictures: Count | None = None  # that the segmenter failed at
     provenance: Provenance = Provenance()  # of the map

@@ -216,8 +216,9 @@ def wrong_place(
     part, so that none learns from views of a test place; and of another country, whose places calibrate others. No
     view is of a sealed place.
 
-    With `is_pictured` it is a region with imagery. Few places have some: in a hold-out where no other of the same part
-    has, it is of a train place, from whose pictures anybody may learn.
+    With `is_pictured` it is a region with imagery, which may be passed on if the region's own may. Few places have
+    some: in a hold-out where no other of the same part has, it is of a train place, from whose pictures anybody may
+    learn.
     """
     places = split.spec.place
     at = next((index for index, place in enumerate(places) if region.id in place.region_ids), None)
@@ -234,12 +235,18 @@ def wrong_place(
         if place.part == part
         for name in place.region_ids
         if name in known and set(region.class_names) <= set(known[name].class_names)
-        if known[name].imagery or not is_pictured
+        if not is_pictured or _lends_picture(known[name], region)
     ]
     alike = [one for one in fitting if _is_town(one) == _is_town(region)]
     if not alike and region.classes is not None:
         alike = fitting
     return alike[0] if alike else None
+
+
+def _lends_picture(other: RegionFile, region: RegionFile) -> bool:
+    """Return whether pictures of another region may be among those of a region: what may be passed on stays so."""
+    may_pass = all(entry.publish for entry in other.imagery)
+    return bool(other.imagery) and (may_pass or not all(entry.publish for entry in region.imagery))
 
 
 def _is_town(region: RegionFile) -> bool:

@@ -187,8 +187,8 @@ def test_without_a_second_place_of_its_kind_a_region_has_no_wrong_place(tmp_path
 
 def pictured(known, *names):
     """Region files of which the named ones have imagery."""
-    entry = next(item.imagery for item in known.values() if item.imagery)
-    return {name: item.model_copy(update={"imagery": entry if name in names else []}) for name, item in known.items()}
+    entry = next(item.imagery[0] for item in known.values() if item.imagery).model_copy(update={"publish": True})
+    return {name: item.model_copy(update={"imagery": [entry] if name in names else []}) for name, item in known.items()}
 
 
 @pytest.mark.parametrize(
@@ -213,6 +213,21 @@ def test_a_wrong_picture_is_of_the_same_part_or_a_train_place(region, with_pictu
     files = pictured(known, *with_pictures)
     other = wrong_place(split, files[region], files, is_pictured=True)
     assert (other and other.id) == expected
+
+
+def test_a_picture_that_must_not_be_passed_on_is_not_lent_to_one_that_may(known, tmp_path):
+    path = own_split(tmp_path, "vaduz", "munich", "porto", "lauf")  # train and test in turn
+    split = make_split(read_split_file(path), {name: item.grid() for name, item in known.items()})
+    files = pictured(known, "vaduz", "porto")
+    closed, lent = [], []
+    for own, other in ((True, True), (True, False), (False, False), (False, True)):
+        for name, publish in (("vaduz", own), ("porto", other)):
+            entry = files[name].imagery[0].model_copy(update={"publish": publish})
+            files[name] = files[name].model_copy(update={"imagery": [entry]})
+        found = wrong_place(split, files["vaduz"], files, is_pictured=True)
+        (closed if found is None else lent).append((own, other))
+    assert closed == [(True, False)]
+    assert len(lent) == 3
 
 
 def test_a_suite_searches_the_older_maps_of_fitting_age_or_every_one():

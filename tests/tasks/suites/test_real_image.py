@@ -27,7 +27,7 @@ from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, ViewRequest
 from sasgeo_bench.tasks.suites.real_image import ABSENT, DEGRADED, FRAMES, OLDER, REAL_IMAGE, TURNED, VIEW
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
-from sasgeo_bench.tasks.task_files import read_queries, read_truths
+from sasgeo_bench.tasks.task_files import Task, read_queries, read_truths
 from sasgeo_bench.tasks.task_plan import Request
 from tests.regions import imagery_place
 from tests.regions.imagery_place import SOUTH, WEST, Hamlet, make_hamlet, write_houses, write_mosaic, write_picture
@@ -73,7 +73,8 @@ def lay_village(folder: Path, out: Path, name: str, *, largest_m: float, seed: i
             bands, transform = whole.read(window=part), whole.window_transform(part)
         write_picture(folder / "mosaic.tif", bands, transform=transform)
         spec = Hamlet(folder=folder, houses=houses).spec()
-    spec = spec.model_copy(update={"id": name, "largest_view_m": largest_m})
+    entry = spec.imagery[0].model_copy(update={"attribution": f"(c) {name}"})
+    spec = spec.model_copy(update={"id": name, "largest_view_m": largest_m, "imagery": [entry]})
     build_region(plan_build(spec, out=out, extract_folders=[folder], imagery_folders=[folder]))
     return Village(spec=spec, folder=folder, out=out)
 
@@ -446,6 +447,12 @@ def test_a_small_place_has_its_largest_view_in_both_discs_and_another_town_in_on
     for query, truth in pairs(drawn):
         off_m = [truth.pose.easting_m, truth.pose.northing_m] if truth.pose else [WEST + 192, SOUTH + 192]
         assert np.hypot(*(np.array(query.prior.center_m) - off_m)) <= query.prior.radius_m + 150 * (truth.pose is None)
+
+
+def test_a_task_names_the_owners_of_all_its_pictures(drawn):
+    for region in ("hamlet", "hamlet+real-image"):
+        task = Task.open(drawn / "tasks" / "real-image" / region, drawn)
+        assert task.manifest.picture_attribution == "(c) somebody with a drone (CC-BY-4.0); (c) village (CC-BY-4.0)"
 
 
 def test_the_degraded_map_lacks_houses_and_no_site_is_nearer_than_a_view_is_wide(drawn):

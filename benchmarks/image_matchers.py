@@ -32,7 +32,7 @@ import sasgeo_bench as sgb
 from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.tasks.frames import encode_webp
 
-MATCHERS = ("ncc_gradient", "hog_colour", "orb_vlad", "orb_homography")
+MATCHERS = ("ncc_gradient", "ncc_gradient_masked", "hog_colour", "orb_vlad", "orb_homography", "orb_homography_masked")
 SIDE_M, PICTURE_PX, HEIGHT_M, GSD_M = 128.0, 512, 100.0, 0.3
 NEAR_M, NEAR_TASK_M = 10.0, 25.0
 

@@ -188,11 +188,16 @@ class _Kit:
 
 
 def _is_same(one: Query, other: Query) -> bool:
-    """Return whether two queries ask the same: view, map, prior, candidates and vectors."""
+    """Return whether two queries ask the same: view, pictures, map, prior, candidates and vectors."""
     if (one.vectors is None) != (other.vectors is None):
         return False
     vectors = one.vectors is None or (
         one.vectors.geometry.to_wkb().tolist() == other.vectors.geometry.to_wkb().tolist()  # type: ignore[union-attr]
     )
     same = (one.region, one.prior, one.candidates) == (other.region, other.prior, other.candidates)
-    return same and vectors and bool(np.array_equal(one.evidence.cells, other.evidence.cells))
+    return (
+        same
+        and one.frames == other.frames
+        and vectors
+        and bool(np.array_equal(one.evidence.cells, other.evidence.cells))
+    )

@@ -10,7 +10,11 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import shapely
 from sasgeo_baselines.image.deep_retrieval import DeepRetrieval
+from sasgeo_baselines.image.ncc_gradient import NccGradientMasked
+from sasgeo_baselines.image.orb_homography import OrbHomography, OrbHomographyMasked
+from sasgeo_baselines.image.view_image import under_roofs
 
 import sasgeo_bench as sgb
 from sasgeo_bench.matching.matcher import check_match, lacks
@@ -21,7 +25,7 @@ from tests.regions.imagery_place import SOUTH, WEST, make_hamlet
 
 NAMES = (
     *("deep_retrieval", "hog_colour", "hu_dual_reference", "hu_imagery_only", "ncc_gradient", "orb_homography"),
-    "orb_vlad",
+    *("ncc_gradient_masked", "orb_vlad"),  # beside its roofs, the place has no corners for orb_homography_masked
 )
 SIDE_M, PICTURE_PX, HEIGHT_M = 112.0, 400, 80.0
 TRUTH = sgb.Pose(easting_m=WEST + 205.0, northing_m=SOUTH + 172.0, yaw_deg=65.0, scale=1.03)
@@ -172,3 +176,75 @@ def test_each_needs_a_picture_and_imagery_and_withholds_on_a_map_without(name, w
     made = made_of(name, drawn_file)
     made.prepare(SimpleNamespace(imagery=None), None)
     assert made.match(query, top_k=5) == sgb.WITHHELD
+
+
+# --- masked by the map
+
+
+def mapped_houses(region: sgb.Region) -> shapely.Geometry:
+    """Houses on ground of which the map knows, less its rim."""
+    return shapely.union_all(region.features.geometry.to_list()) & region.coverage.buffer(-3)
+
+
+def test_what_lies_under_roofs_is_told_on_any_lattice(region):
+    west_m, south_m, _, _ = region.grid.bounds_m
+    grid = sgb.Grid(
+        epsg=region.grid.epsg, west_m=west_m - 7.3, north_m=south_m + 200.4, cell_size_m=0.7, rows=300, cols=250
+    )
+    found = under_roofs(region, grid)
+    rows, cols = np.indices(grid.shape)
+    middles = grid.to_en_m(np.column_stack((cols.ravel() + 0.5, rows.ravel() + 0.5)))
+    houses = shapely.union_all(region.features.geometry.to_list())
+    near_m, far_m = (
+        shapely.distance(shapely.points(middles), shape).reshape(grid.shape)
+        for shape in (mapped_houses(region), houses)
+    )
+    assert found[near_m < 1.0].all()
+    assert not found[far_m > 4.5].any()  # two metres along both axes, and a cell
+    assert 0.2 < found.mean() < 0.8
+    without = SimpleNamespace(classes=("water",), grid=region.grid)
+    assert not under_roofs(without, grid).any()
+
+
+def test_no_feature_of_a_masked_map_lies_on_a_roof(region):
+    counts = []
+    for made in (OrbHomography(), OrbHomographyMasked()):
+        made.prepare(region, None)
+        points = shapely.points(made._features.points)
+        counts.append((len(points), int(shapely.contains(mapped_houses(region), points).sum())))
+    assert counts[0][1] > 20
+    assert counts[1][1] == 0
+    assert 0 < counts[1][0] < counts[0][0]
+
+
+@pytest.mark.parametrize("made", [NccGradientMasked(), OrbHomographyMasked()], ids=lambda made: made.card.name)
+def test_a_masked_matcher_finds_the_place_by_the_ground_whatever_is_on_the_roofs(made, region, window):
+    """Fields of many greys lie between the houses; the roofs of view and imagery have nothing in common."""
+    rng, (rows, cols) = np.random.default_rng(2), window.grid.shape
+    fields = rng.integers(40, 220, (rows // 7 + 1, cols // 7 + 1), dtype=np.uint8).repeat(7, 0).repeat(7, 1)
+    is_roof = under_roofs(region, window.grid)
+
+    def painted() -> np.ndarray:
+        roofs = rng.integers(0, 255, (rows // 5 + 1, cols // 5 + 1), dtype=np.uint8).repeat(5, 0).repeat(5, 1)
+        grey = np.where(is_roof, roofs[:rows, :cols], fields[:rows, :cols])
+        return np.repeat(grey[..., None], 3, axis=2)
+
+    rgb = painted()
+
+    class Repainted:
+        record, epsg = region.imagery.record, region.imagery.epsg
+
+        def read(self, bounds_m, *, gsd_m):
+            part = region.imagery.read(bounds_m, gsd_m=gsd_m)
+            at = window.grid.to_cells(
+                part.grid.to_en_m(np.argwhere(np.ones(part.grid.shape, dtype=bool))[:, ::-1] + 0.5)
+            )
+            row, col = np.clip(at, 0, np.array(window.grid.shape) - 1).T
+            return replace(part, rgb=rgb[row, col].reshape(part.rgb.shape))
+
+    made.prepare(
+        SimpleNamespace(imagery=Repainted(), grid=region.grid, classes=region.classes, layer=region.layer), None
+    )
+    match = made.match(query_of(picture(replace(window, rgb=painted()), TRUTH)), top_k=1)
+    assert match.poses
+    assert off_m(match.poses[0]) < 10.0

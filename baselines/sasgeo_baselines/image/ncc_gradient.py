@@ -20,7 +20,17 @@ from sasgeo_baselines.image.dense import (
     disc_of,
     size_for,
 )
-from sasgeo_baselines.image.view_image import LIMITS, PICTURE, Ortho, ViewImage, grey_of, side_of, view_image
+from sasgeo_baselines.image.view_image import (
+    LIMITS,
+    MASKED,
+    PICTURE,
+    Ortho,
+    ViewImage,
+    grey_of,
+    side_of,
+    under_roofs,
+    view_image,
+)
 
 COARSE_M: Final = 2.0  # pixels of the search
 FINE_M: Final = 1.0  # of the local one that follows
@@ -69,6 +79,8 @@ class NccGradient:
         limits=f"Slow where the heading is unknown; half of the view must be on the imagery; {LIMITS}",
     )
 
+    is_masked = False  # roofs of the map count as unknown
+
     def __init__(self) -> None:
         self._grey: NDArray[np.uint8] | None = None
 
@@ -80,7 +92,12 @@ class NccGradient:
         if fine is None or coarse is None:
             return
         self._grey, self._known, self._fine = grey_of(fine.rgb, fine.is_known), fine.is_known, fine.grid
-        self._stack, self._grid = directions(grey_of(coarse.rgb, coarse.is_known), coarse.is_known), coarse.grid
+        self._grid = coarse.grid
+        self._is_kept, is_kept = (
+            ~under_roofs(region, grid) if self.is_masked else np.ones(grid.shape, dtype=bool)
+            for grid in (self._fine, self._grid)
+        )
+        self._stack = _where(directions(grey_of(coarse.rgb, coarse.is_known), coarse.is_known), is_kept)
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
         """Return the best poses, or rank the candidates by the best pose near each."""
@@ -115,7 +132,7 @@ class NccGradient:
         whole = reach + margin + 2 * _RIM_PX
         top, left = max(row - whole, 0), max(col - whole, 0)
         cut = (slice(top, row + whole + 1), slice(left, col + whole + 1))
-        stack = directions(self._grey[cut], self._known[cut])
+        stack = _where(directions(self._grey[cut], self._known[cut]), self._is_kept[cut])
         part = self._fine.window(top, left, *stack.is_known.shape)
         low, high = (row - top, col - left), stack.is_known.shape
         bounds = (
@@ -125,6 +142,24 @@ class NccGradient:
         question = Question(seen_image=seen_image, bounds=(bounds[0], bounds[1], bounds[2], bounds[3]), turns=turns)
         found = _search(stack, part, question).best(disc, most=1)
         return found[0] if found else mode
+
+
+class NccGradientMasked(NccGradient):
+    """`ncc_gradient_masked`: the same without the roofs of the map."""
+
+    is_masked = True
+    card = replace(
+        NccGradient.card,
+        name="ncc_gradient_masked",
+        title="Directions of gradients against imagery, roofs of the map left out",
+        ours=f"`ncc_gradient` {MASKED}",
+        limits=f"Half of the view must be on imagery beside roofs; {NccGradient.card.limits}",
+    )
+
+
+def _where(stack: Stack, is_kept: NDArray[np.bool_]) -> Stack:
+    """Return a stack that is unknown where it is not kept."""
+    return Stack(channels=stack.channels * is_kept, is_known=stack.is_known & is_kept)
 
 
 def _search(stack: Stack, grid: sgb.Grid, question: Question) -> Field:

@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Final
 
 import cv2
@@ -21,7 +22,7 @@ from sasgeo_baselines.image.dense import (
     disc_of,
 )
 from sasgeo_baselines.image.features import PIXEL_M, Features, map_features, view_features
-from sasgeo_baselines.image.view_image import LIMITS, PICTURE, side_of, view_image
+from sasgeo_baselines.image.view_image import LIMITS, MASKED, PICTURE, side_of, under_roofs, view_image
 
 RATIO: Final = 0.85
 NEAR_M: Final = 3.0  # of a match from where the similarity puts it
@@ -102,6 +103,8 @@ class OrbHomography:
         limits=f"Needs corners that light and seasons leave alone; answers nothing where few agree; {LIMITS}",
     )
 
+    is_masked = False  # features on roofs of the map are left out
+
     def __init__(self) -> None:
         self._features: Features | None = None
 
@@ -112,6 +115,9 @@ class OrbHomography:
         self._features = None
         if found is not None:
             self._features, self._grid = found
+            if self.is_masked:
+                row, col = self._grid.to_cells(self._features.points).T
+                self._features = self._features.chosen(~under_roofs(region, self._grid)[row, col])
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
         """Return the similarities with most matches, or rank the candidates by that of the window around each."""
@@ -155,3 +161,15 @@ class OrbHomography:
         ours, theirs = (np.array([getattr(item, name) for item in chosen]) for name in ("queryIdx", "trainIdx"))
         mode = similarity(seen.points[ours], mapped.points[theirs])
         return mode if mode is not None and is_likely(mode.pose, prior) else None
+
+
+class OrbHomographyMasked(OrbHomography):
+    """`orb_homography_masked`: the same without features on the roofs of the map."""
+
+    is_masked = True
+    card = replace(
+        OrbHomography.card,
+        name="orb_homography_masked",
+        title="ORB features beside the roofs of the map, and a similarity by RANSAC",
+        ours=f"`orb_homography` {MASKED}",
+    )

@@ -26,6 +26,13 @@ LIMITS: Final = (
 )
 
 
+MASKED: Final = (
+    "without what lies under roofs of the map or within 2 m of one: roofs lean and are seen from elsewhere, roads and "
+    "fields are where the map has them"
+)
+_EAVES_M: Final = 2.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class ViewImage:
     """A picture on a square lattice: `rgb`, uint8 of shape (n, n, 3), and where it shows something, shape (n, n)."""
@@ -61,6 +68,21 @@ class ViewImage:
 
 
 _HOW: Final = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+
+
+def under_roofs(region: sgb.Region, grid: sgb.Grid) -> NDArray[np.bool_]:
+    """Return which pixels of a lattice lie under buildings of the map or within `_EAVES_M` of one, (rows, cols)."""
+    if "building" not in region.classes:
+        return np.zeros(grid.shape, dtype=bool)
+    is_roof = (region.layer("building") == sgb.PRESENT).astype(np.uint8)
+    reach = 2 * round(_EAVES_M / region.grid.cell_size_m) + 1
+    is_roof = np.pad(np.asarray(cv2.dilate(is_roof, np.ones((reach, reach), dtype=np.uint8))), 1)
+    # Both lattices have their north up: a row of one is a row of the other.
+    across, down = np.arange(grid.cols) + 0.5, np.arange(grid.rows) + 0.5
+    cols = region.grid.to_cells(grid.to_en_m(np.column_stack((across, np.zeros_like(across)))))[:, 1]
+    rows = region.grid.to_cells(grid.to_en_m(np.column_stack((np.zeros_like(down), down))))[:, 0]
+    at = np.ix_(*(np.clip(cells + 1, 0, most - 1) for cells, most in zip((rows, cols), is_roof.shape, strict=True)))
+    return np.asarray(is_roof[at] > 0)
 
 
 def side_of(query: sgb.Query) -> float:

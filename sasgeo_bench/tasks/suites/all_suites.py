@@ -8,7 +8,17 @@ from sasgeo_bench.core.errors import ConfigError, MatchError
 from sasgeo_bench.core.plugins import SUITES as GROUP
 from sasgeo_bench.core.plugins import check_own_name, find_inside, list_entry_points, made, plugin_code
 from sasgeo_bench.tasks.query import BY
-from sasgeo_bench.tasks.suites import ages, board_controls, flights, natural, pictures, real_image, twins, views
+from sasgeo_bench.tasks.suites import (
+    ages,
+    board_controls,
+    corrupted,
+    flights,
+    natural,
+    pictures,
+    real_image,
+    twins,
+    views,
+)
 from sasgeo_bench.tasks.suites.base import Suite
 from sasgeo_bench.tasks.suites.flights import FlightSuite
 
@@ -46,7 +56,9 @@ PICTURE_SUITES: Final[dict[str, Suite]] = {
         pictures.LIGHT,
         pictures.SEASON_IMAGE,
         pictures.ACCUMULATED,
+        corrupted.CORRUPTED,
         real_image.REAL_IMAGE,
+        corrupted.CORRUPTED_REAL,
     )
 }
 # Queries of these are the views of a flight in order; they are drawn where they are named.

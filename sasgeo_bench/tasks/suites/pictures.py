@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suites whose queries are pictures: aerial, accumulated, light, oblique, relief and season-image."""
+"""Suites whose queries are rendered pictures: aerial, accumulated, light, oblique, relief and season-image."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,6 +14,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.sensing.accumulation import Errors, believed_steps, steps_between
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
+from sasgeo_bench.sensing.image import Picture
 from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun, draw_conditions
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.sensing.rendering.scene import make_scene
@@ -85,13 +86,14 @@ class CameraBelief:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureSuite(Suite):
-    """A suite whose stress is in how pictures are taken: `flight` of each variant.
+    """A suite whose stress is in how pictures are taken, `flight` of each variant, or in their `change` afterwards.
 
     A site's weather, light and errors of attitude are the same in all variants, so that they differ by the stress
     alone; the noise of the sensor differs, so that a falsifier is another picture of the same.
     """
 
     flight: Callable[[Variant], Flight]
+    change: Callable[[ViewRequest, Picture], Picture] = field(default=lambda _, taken: taken)
 
     @property
     def is_pictured(self) -> bool:
@@ -116,7 +118,7 @@ class PictureSuite(Suite):
         painted = _painted(shot, flight)
         beliefs = camera_beliefs(shot, flight)
         rng = shot.rng("sensor", variant.name)
-        pictures = [render(painted, belief.true, conditions, rng) for belief in beliefs]
+        pictures = [self.change(shot, render(painted, belief.true, conditions, rng)) for belief in beliefs]
         found = [labels(painted, belief.true, season=conditions.season) for belief in beliefs]
         state = shot.scene.world
         is_there = "building" in state.classes

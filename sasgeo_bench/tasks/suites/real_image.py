@@ -138,7 +138,7 @@ class RealImageSuite(Suite):
         is_here = variant.kind != ABSENT
         pictured, site = (here, shot.site) if is_here else self._elsewhere(shot)
         pose = _turned(shot) if variant.kind == TURNED else site.pose
-        cuts, believed = self._cuts(shot, pictured, pose)
+        cuts, believed = self.cuts(shot, pictured, pose)
         classes = pictured.state.classes
         return QueryDraft(
             evidence=unseen(classes, variant.view_cells, variant.cell_size_m),
@@ -153,7 +153,7 @@ class RealImageSuite(Suite):
             measured=_measured(pictured, cuts),
         )
 
-    def _cuts(self, shot: ViewRequest, pictured: PicturedGround, pose: Pose) -> tuple[list[Cut], list[Pose]]:
+    def cuts(self, shot: ViewRequest, pictured: PicturedGround, pose: Pose) -> tuple[list[Cut], list[Pose]]:
         """Return the pictures of a shot, and where each is believed to be taken in the frame of the view."""
         assert shot.scene.pictured is not None  # noqa: S101 - by `lack`
         is_one = shot.variant.kind != FRAMES

@@ -68,6 +68,28 @@ def test_the_suite_of_the_scaffold_keeps_every_rule(written, failed):
     assert failed(written("rows_kept")) == []
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("severity", "broken"), [(2, []), (0, ["a stress changes something"])])
+def test_a_stress_may_lie_in_the_pictures_alone(failed, tmp_path, monkeypatch, severity, broken):
+    text = f"""from dataclasses import replace
+from sasgeo_bench.tasks.suites.corrupted import CORRUPTED
+from sasgeo_bench.tasks.suites.pictures import Flight
+import numpy as np
+
+SUITE = replace(
+    CORRUPTED,
+    card=replace(CORRUPTED.card, name="my-fog"),
+    variants=tuple(replace(one, view_cells=48) for one in CORRUPTED.variants[::82] + CORRUPTED.variants[1:2]),
+    flight=lambda _: Flight(height_m=40.0),
+    change=lambda shot, seen: np.full_like(seen, 9 + {severity} * (shot.variant.role == "stress")),
+)
+"""
+    module = f"fog_{severity}"
+    (tmp_path / f"{module}.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert failed(f"{module}:SUITE") == broken
+
+
 @pytest.mark.parametrize(
     ("rule", "old", "new"),
     [

@@ -16,6 +16,7 @@ from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES, SUITES, find_su
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Seeds, Site, Variant, ViewRequest
 from sasgeo_bench.tasks.suites.pictures import STOPS_M, Flight, PictureSuite, camera_beliefs
 
+ALIKE = ("corrupted", "real-image", "corrupted-real")  # all pictures of these are taken alike
 SMALL = Variant(role="control", kind="control", view_cells=48, detector="rendered")
 
 
@@ -43,7 +44,7 @@ def test_no_suite_of_pictures_is_drawn_unless_it_is_named():
     assert not set(PICTURE_SUITES) & set(SUITES)
 
 
-@pytest.mark.parametrize("name", [name for name in PICTURE_SUITES if name != "real-image"])
+@pytest.mark.parametrize("name", [name for name in PICTURE_SUITES if name not in ALIKE])
 def test_every_suite_has_a_control_a_ladder_and_a_falsifier_that_flies_as_the_control(name):
     suite = PICTURE_SUITES[name]
     assert isinstance(suite, PictureSuite)

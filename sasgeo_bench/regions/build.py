@@ -147,7 +147,9 @@ def plan_build(
 
 def _inputs_sha256(spec: RegionFile, extract: Extract, source_sha256: str) -> str:
     """Hash all inputs of a region: its file, the extract's bytes, the taxonomy, and our versions."""
+    further = spec.provenance.further_sources  # the one line of provenance that every file of a region holds
     inputs = {
+        **({"further_sources": further} if further else {}),
         "region": spec.model_dump(mode="json", exclude={"extract", "provenance"}),
         "extract": extract.model_dump(mode="json", exclude={"urls", "sha256"}),
         "source": source_sha256,

@@ -93,7 +93,8 @@ def test_a_region_of_an_older_file_gets_its_lines_and_stays_the_same_map(tmp_pat
     before = {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
     old = read_manifest(folder)
     assert not old.provenance.titled()
-    plan, given = plan_build(spec_of(**STATED), out=out), []
+    stated = {name: value for name, value in STATED.items() if name != "further_sources"}
+    plan, given = plan_build(spec_of(**stated), out=out), []
     assert not plan.is_current
     with reporting(given.append):
         made = build_region(plan)
@@ -102,10 +103,20 @@ def test_a_region_of_an_older_file_gets_its_lines_and_stays_the_same_map(tmp_pat
     assert (made.fingerprint, made.inputs_sha256, made.files) == (old.fingerprint, old.inputs_sha256, old.files)
     after = {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in folder.iterdir()}
     assert {name for name, about in after.items() if before[name] != about} == {"region.json"}
-    assert plan_build(spec_of(**STATED), out=out).is_current
+    assert plan_build(spec_of(**stated), out=out).is_current
     build_region(plan_build(spec_of(), out=out))
     assert read(folder / "region.json") == old.model_dump(mode="json")
     assert "provenance" not in read(folder / "region.json")
+
+
+def test_a_further_source_that_is_stated_later_is_named_in_every_file(tmp_path, lay_towns):
+    out = lay_towns(tmp_path, TOWN)
+    manifest = build_region(plan_build(spec_of(further_sources="a land survey"), out=out))
+    assert manifest.attribution == f"{ATTRIBUTION}; a land survey"
+    for name in ("layers.tif", "features.parquet", "nodes.parquet", "edges.parquet"):
+        assert b"a land survey" in (out / "regions" / TOWN / name).read_bytes(), name
+    build_region(plan_build(spec_of(), out=out))
+    assert b"a land survey" not in (out / "regions" / TOWN / "layers.tif").read_bytes()
 
 
 def test_a_misspelt_line_is_refused_and_one_of_a_later_version_is_kept():

@@ -4,7 +4,7 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -44,7 +44,7 @@ from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.pose import columns_of
 from sasgeo_bench.scoring.score import single_views
-from sasgeo_bench.tasks.query import CONTROLS, Truth, base_of
+from sasgeo_bench.tasks.query import CONTROLS, REAL, Truth, base_of
 from sasgeo_bench.tasks.sheet import panels_of, sheet_figure
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import Task, TaskManifest
@@ -251,7 +251,10 @@ def _add_strips(found: _Found, scored: Scored, asked: Mapping[tuple[str, str], T
 
 def _strip(strip: Strip, cases: Mapping[str, Case], tasks: Mapping[tuple[str, str], Task], *, title: str) -> bytes:
     own = [cases[query_id] for query_id in strip.query_ids if query_id in cases]
-    rows = [read_picture(case, tasks[case.query.suite, case.query.region]) for case in own]
+    named = [(case, tasks[case.query.suite, case.query.region]) for case in own]
+    rows = [read_picture(case, task) for case, task in named if not is_kept_back(case, task)]
+    if named and not rows:
+        raise StoreError("for photographs of which no region file says that they may be passed on")
     return fitted(strip_pixels(strip, rows, title=title), STRIP_BYTES)
 
 
@@ -333,7 +336,19 @@ def _picture(outcome: bytes | Exception) -> bytes:
 
 
 def _drawn(case: Case, task: Task) -> bytes:
-    return fitted(case_pixels(read_picture(case, task)), CASE_BYTES)
+    shown = read_picture(case, task)
+    if is_kept_back(case, task):
+        shown = replace(shown, picture=None, segmented=None)
+    return fitted(case_pixels(shown), CASE_BYTES)
+
+
+def is_kept_back(case: Case, task: Task) -> bool:
+    """Return whether a query shows a photograph that may not be passed on, as far as its region is known."""
+    if case.truth.detector != REAL:
+        return False
+    # Edited maps have no imagery: a photograph of another town goes with that of the region itself.
+    imagery = region_files.read_manifest(task.region.with_name(base_of(task.region.name))).imagery
+    return imagery is None or not imagery.is_publishable
 
 
 def _cases(

@@ -32,7 +32,7 @@ from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.graph import build_graph
-from sasgeo_bench.regions.imagery import ORTHO, Imagery, OffsetRecord, OrthoRecord, find_imagery
+from sasgeo_bench.regions.imagery import OFFSET_VERSION, ORTHO, Imagery, OffsetRecord, OrthoRecord, find_imagery
 from sasgeo_bench.regions.layers import PaintWindow, burn, burn_mapped, make_paint, read_overview, write_layers
 from sasgeo_bench.regions.ortho import Picture, check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.region import (
@@ -147,7 +147,9 @@ def plan_build(
 
 def _inputs_sha256(spec: RegionFile, extract: Extract, source_sha256: str) -> str:
     """Hash all inputs of a region: its file, the extract's bytes, the taxonomy, and our versions."""
+    further = spec.provenance.further_sources  # the one line of provenance that every file of a region holds
     inputs = {
+        **({"further_sources": further} if further else {}),
         "region": spec.model_dump(mode="json", exclude={"extract", "provenance"}),
         "extract": extract.model_dump(mode="json", exclude={"urls", "sha256"}),
         "source": source_sha256,
@@ -172,7 +174,13 @@ def _kept(folder: Path, inputs_sha256: str) -> Manifest | None:
         (folder / name).is_file() and (folder / name).stat().st_size == record.bytes
         for name, record in manifest.files.items()
     )
-    return manifest if sizes_hold and manifest.inputs_sha256 == inputs_sha256 else None
+    is_of_inputs = manifest.inputs_sha256 == inputs_sha256 and _is_measured(manifest.imagery)
+    return manifest if sizes_hold and is_of_inputs else None
+
+
+def _is_measured(imagery: OrthoRecord | None) -> bool:
+    """Return whether the offset of imagery, if it has one, is what this program finds; the map's hash is without it."""
+    return imagery is None or imagery.is_rendered or imagery.offset_version == OFFSET_VERSION
 
 
 def _is_shown(manifest: Manifest) -> bool:
@@ -259,7 +267,7 @@ def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading) -> OrthoRec
     share = share_shown(imagery, reading.coverage, plan.grid.cell_size_m)
     shown = f"{name}: imagery shows {share:.1%} of the mapped ground"
     tell(f"{shown}, off the map by {offset.to_text()}" if offset else f"{shown}; its offset could not be measured")
-    return record.model_copy(update={"offset": offset, "share": share})
+    return record.model_copy(update={"offset": offset, "offset_version": OFFSET_VERSION, "share": share})
 
 
 def share_shown(imagery: Imagery, mapped: shapely.Geometry, cell_size_m: float) -> float:

@@ -89,7 +89,8 @@ class Evidence:
             Side of a cell on the ground for scale 1, metres.
         present_at, absent_at : float
             A cell is PRESENT from `present_at` on, ABSENT below `absent_at` or at it, UNKNOWN between: nothing is kept
-            of a probability there.
+            of a probability there. A PRESENT cell of less than 0.5, or an ABSENT one of more, has confidence 0: it
+            reads as 0.5.
 
         Raises
         ------
@@ -112,7 +113,9 @@ class Evidence:
         cells = np.full(probabilities.shape, UNKNOWN, dtype=np.uint8)
         cells[probabilities <= absent_at] = ABSENT
         cells[probabilities >= present_at] = PRESENT
-        confidence = np.where(cells == UNKNOWN, 0, np.rint(CERTAIN * np.abs(2 * filled - 1))).astype(np.uint8)
+        # For its state: |2 P - 1| of a present cell of 0.4 would be read back as 0.6.
+        sureness = np.where(cells == PRESENT, 2 * filled - 1, 1 - 2 * filled).clip(0)
+        confidence = np.where(cells == UNKNOWN, 0, np.rint(CERTAIN * sureness)).astype(np.uint8)
         return cls(classes=classes, cells=cells, cell_size_m=cell_size_m, confidence=confidence)
 
     def levels(self) -> NDArray[np.uint16]:

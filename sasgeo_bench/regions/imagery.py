@@ -21,6 +21,7 @@ from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, PlainName, Sha256, imagery
 ORTHO: Final = "ortho.tif"
 MOST_WINDOW_PIXELS: Final = 64_000_000  # 256 MB as colours and mask
 BANDS: Final = (1, 2, 3)  # red, green, blue
+OFFSET_VERSION: Final = 1  # raised whenever the same imagery and map give another offset
 
 Bounds = tuple[float, float, float, float]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -108,7 +109,10 @@ class OrthoRecord(JsonDocument):
     """The imagery of a region as `region.json` holds it: its pictures, lattice and offset against the map.
 
     `bounds_m` are west, south, east, north; `share` is the fraction of the mapped ground that it shows.
+    `offset_version` is `OFFSET_VERSION` of the program that measured the offset, 0 in files of earlier ones.
     """
+
+    without_empty: ClassVar = frozenset({"offset_version"})
 
     pictures: Annotated[tuple[PictureRecord, ...], Field(min_length=1)]
     gsd_m: Annotated[float, Field(gt=0)]
@@ -117,6 +121,7 @@ class OrthoRecord(JsonDocument):
     cols: Annotated[int, Field(ge=1)]
     share: Share
     offset: OffsetRecord | None
+    offset_version: Annotated[int, Field(ge=0)] = 0
 
     @property
     def is_publishable(self) -> bool:

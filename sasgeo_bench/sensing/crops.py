@@ -141,7 +141,7 @@ def real_crops(
     Raises
     ------
     ConfigError
-        If there is no region, one has no imagery, or a setting is out of range.
+        If there is no region, one has no imagery or a rendered one, or a setting is out of range.
     ImageryError
         If no crop that shows enough mapped ground is found.
     """
@@ -313,8 +313,8 @@ class _Picture:
     """The imagery of a region with its map."""
 
     def __init__(self, region: Region, shape: _Shape, bounds_m: Bounds | None) -> None:
-        if region.imagery is None:
-            raise ConfigError(f"{region.manifest.id} has no imagery: build it with imagery, or take drawn_crops")
+        if region.imagery is None or region.imagery.record.is_rendered:
+            raise ConfigError(f"{region.manifest.id} has no real imagery: build it with imagery, or take drawn_crops")
         self._region, self._shape, self._imagery = region, shape, region.imagery
         self._paint = make_paint(region.features, region.classes, region.coverage)
         offset = self._imagery.record.offset

@@ -3,12 +3,14 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
-from sasgeo_bench.boards.board_pictures import STRIP_BYTES, pictures_extra
+from sasgeo_bench.boards import board_pictures
+from sasgeo_bench.boards.board_pictures import STRIP_BYTES, case_pixels, is_kept_back, pictures_extra
 from sasgeo_bench.boards.build import make_board
 from sasgeo_bench.boards.publish import publish
 from sasgeo_bench.boards.scored import ScoreRequest
@@ -22,19 +24,21 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frames import Frame, encode_webp
 from sasgeo_bench.tasks.segmented import Segmented, segmented_file, write_segmented
+from tests import world
+from tests.regions.imagery_place import make_hamlet
 
 SUITE, REGION, HASH = "aerial+good", "town-riverside", "0123456789ab"
 DRAWN = tiny_images()[0]
 
 
-def put_pictures(out, tasks):
+def put_pictures(out, tasks, detector="rendered"):
     """Queries of another suite, each with one picture and what is seen in it."""
     folder, hidden = tasks / "tasks" / "absent" / REGION, tasks / "truth" / "absent" / REGION
     truths = {truth.query_id: truth for truth in task_files.read_truths(hidden)}
     frame = Frame(picture=encode_webp(DRAWN.image.rgb), camera=DRAWN.image.camera)
     asked = [query for query in task_files.read_queries(folder) if truths[query.query_id].is_present]
     pairs = [
-        (replace(query, suite=SUITE, frames=(frame,)), replace(truths[query.query_id], detector="rendered"))
+        (replace(query, suite=SUITE, frames=(frame,)), replace(truths[query.query_id], detector=detector))
         for query in asked
         if query.track == "localization"
     ]
@@ -64,21 +68,23 @@ def run(out, task, pairs, name, rights):
     RunManifest(**about, queries_sha256=sha256).save(folder)
 
 
-@pytest.fixture(scope="module")
-def board(tasks, tmp_path_factory):
-    """A board of two matchers on pictures, in out/boards/mine."""
-    out = tmp_path_factory.mktemp("strips") / "out"
+def lay_board(out, tasks, detector="rendered"):
+    """A board of two matchers on pictures, in out/boards/mine, and what was said of its pictures."""
     out.mkdir()
     (out / "regions").symlink_to(tasks / "regions")
-    task, pairs = put_pictures(out, tasks)
+    task, pairs = put_pictures(out, tasks, detector)
     for name, rights in (("worse", 1), ("better", 2)):
         run(out, task, pairs, name, rights)
-    folder = out / "boards" / "mine"
-    with reporting(print):
+    folder, told = out / "boards" / "mine", []
+    with reporting(told.append):
         extras = (lambda found: pictures_extra(found, root=out),)
-    with reporting(print):
         make_board(ScoreRequest(predictions=[out / "runs"], root=out, board=folder, draws=100), extras)
-    return folder
+    return folder, told
+
+
+@pytest.fixture(scope="module")
+def board(tasks, tmp_path_factory):
+    return lay_board(tmp_path_factory.mktemp("strips") / "out", tasks)[0]
 
 
 def test_a_board_on_pictures_has_a_strip_of_the_matcher_that_finds_most(board):
@@ -88,6 +94,29 @@ def test_a_board_on_pictures_has_a_strip_of_the_matcher_that_finds_most(board):
     path = board / "pictures" / strip["file"]
     assert path.stat().st_size <= STRIP_BYTES
     assert cv2.imread(str(path)).shape[1] > 800
+
+
+def test_no_photograph_stands_on_a_board_that_nobody_allowed_to_pass_on(tasks, tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(board_pictures, "case_pixels", lambda case: shown.append(case) or case_pixels(case))
+    folder, told = lay_board(tmp_path / "out", tasks, "real")
+    listed = json.loads((folder / "pictures" / "pictures.json").read_text(encoding="utf-8"))
+    assert listed["strips"] == []
+    assert len(listed["cases"]) == len(shown) > 0
+    assert all(case.picture is None and case.segmented is None for case in shown)
+    assert any(line.startswith("left out: 1 picture, for photographs of which no region file says") for line in told)
+
+
+@pytest.mark.parametrize(
+    ("detector", "publish", "is_kept"), [("real", False, True), ("real", True, False), ("rendered", False, False)]
+)
+def test_a_photograph_is_shown_where_its_region_file_says_so(detector, publish, is_kept, tmp_path):
+    hamlet = make_hamlet(tmp_path / "files").but(publish=publish)
+    folders = {"extract_folders": [hamlet.folder], "imagery_folders": [hamlet.folder]}
+    folder = world.built(hamlet.spec(), tmp_path / "out", **folders)
+    case = SimpleNamespace(truth=SimpleNamespace(detector=detector))
+    for name in (folder.name, f"{folder.name}+real-image"):  # an edited map has no imagery of its own
+        assert is_kept_back(case, SimpleNamespace(region=folder.with_name(name))) == is_kept
 
 
 @pytest.mark.usefixtures("plain_site")

@@ -168,6 +168,17 @@ def test_undecided_probabilities_are_unknown_and_others_beyond_0_to_1_are_refuse
         Evidence.of_probabilities(("a",), np.array([[[0.5, -0.1]]]), cell_size_m=1.0)
 
 
+@pytest.mark.parametrize("at", [0.3, 0.7])
+def test_no_threshold_turns_a_probability_over(at):
+    chances = np.array([[[0.1, 0.35, 0.45, 0.55, 0.65, 0.9]]])
+    seen = Evidence.of_probabilities(("a",), chances, cell_size_m=1.0, present_at=at, absent_at=at)
+    np.testing.assert_array_equal(seen.cells == PRESENT, chances >= at)
+    found = seen.probabilities()
+    assert ((found - 0.5) * (chances - 0.5) >= 0).all()
+    assert (found[(found - 0.5) * (chances - 0.5) == 0] == 0.5).all()
+    assert np.abs(found - chances)[found != 0.5] == pytest.approx(0, abs=1 / 510)
+
+
 def test_unknown_cells_as_absent_are_certain_and_the_others_stay():
     seen = Evidence.of_probabilities(("a",), np.array([[[0.9, np.nan, 0.3]]]), cell_size_m=1.0)
     assert seen.without_unknown().levels().tolist() == [[[459, 0, 153]]]

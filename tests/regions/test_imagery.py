@@ -2,6 +2,7 @@
 """Aerial pictures of a place: cut, reprojected, held against the map, read window by window; bad ones are refused."""
 
 import datetime as dt
+import json
 import re
 import shutil
 from pathlib import Path
@@ -55,6 +56,22 @@ def refusal(hamlet: Hamlet, out: Path) -> str:
     assert not list(out.rglob("region.json"))
     assert "\n" not in str(found.value)
     return str(found.value)
+
+
+def test_a_region_whose_offset_an_earlier_program_measured_is_built_again(hamlet, built, tmp_path):
+    folder = tmp_path / "regions" / built.name
+    shutil.copytree(built, folder)
+    about = json.loads((folder / "region.json").read_text(encoding="utf-8"))
+    del about["imagery"]["offset_version"]
+    about["imagery"]["offset"] = None
+    (folder / "region.json").write_text(json.dumps(about), encoding="utf-8")
+    before = read_manifest(folder)
+    assert build(hamlet, tmp_path) == folder
+    after = read_manifest(folder)
+    assert after.imagery.offset.east_m == pytest.approx(OFF_M[0], abs=0.3)
+    assert (after.inputs_sha256, after.fingerprint) == (before.inputs_sha256, before.fingerprint)  # answers stay
+    plan = plan_build(hamlet.spec(), out=tmp_path, extract_folders=[hamlet.folder])  # pictures are not looked for
+    assert plan.is_current
 
 
 def test_a_picture_becomes_a_cloud_optimized_file_beside_the_layers(built):

@@ -15,7 +15,7 @@ from sasgeo_bench.core.errors import ConfigError, ImageryError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, observe
-from sasgeo_bench.regions.imagery import ImageryWindow
+from sasgeo_bench.regions.imagery import ImageryWindow, RenderedRecord
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sensing.crops import drawn_crops, real_crops
 from sasgeo_bench.sensing.rendering.sheet import make_sheet
@@ -235,8 +235,13 @@ def test_a_setting_out_of_range_is_refused_before_the_first_crop(change, word, t
 def test_no_region_no_imagery_and_bounds_of_several_are_refused(town, photographed):
     with pytest.raises(ConfigError, match="at least one region"):
         drawn_crops([], seed=1)
-    with pytest.raises(ConfigError, match="town-riverside has no imagery"):
+    with pytest.raises(ConfigError, match="town-riverside has no real imagery"):
         real_crops([town], seed=1)
+    record = photographed.imagery.record
+    drawn = record.pictures[0].model_copy(update={"rendered": RenderedRecord.model_construct()})
+    imagery = replace(photographed.imagery, record=record.model_copy(update={"pictures": (drawn,)}))
+    with pytest.raises(ConfigError, match="hamlet has no real imagery"):  # a rendered one
+        real_crops([replace(photographed, imagery=imagery)], seed=1)
     with pytest.raises(ConfigError, match="bounds_m is of one region"):
         real_crops([photographed, photographed], seed=1, bounds_m=(0.0, 0.0, 1.0, 1.0))
     with pytest.raises(ConfigError, match=r"shows 30 x 30 m of the map within the bounds"):

@@ -42,6 +42,7 @@ _FINE_M: Final = 128.0  # widest view in fine cells
 _FINE_CELL_M: Final = 0.5
 _PICTURE: Final = 1.25  # times the view's side is what a picture shows
 _MOST_PX: Final = 768
+_MOST_BLUR: Final = 1.1  # times as wide as those of a view may pixels of another town be: its blur would tell it
 _HEIGHT_M: Final = 2000.0  # of the camera that a mosaic stands for: from there nothing leans
 _TRIES: Final = 4000
 
@@ -89,7 +90,7 @@ class RealImageSuite(Suite):
         return _of_sides(self.variants, fit or [min(SIDES_M)])
 
     def usable(self, scene: Scene) -> tuple[Variant, ...]:
-        """Return the variants that the picture resolves: R3 for each older map, R4 where there is another picture."""
+        """Return the variants that the picture resolves: R3 for each older map, R4 where there is one as sharp."""
         assert scene.pictured is not None  # noqa: S101 - by `lack`
         least_m = LEAST_PX * scene.pictured.own_gsd_m
         there = {variant.side_m for variant in self.variants}
@@ -99,7 +100,7 @@ class RealImageSuite(Suite):
         for variant in _of_sides(self.variants, resolved_m):
             if variant.kind == OLDER:
                 found += [replace(variant, kind=f"{_OF}{state.date}") for state in older]
-            elif variant.kind != ABSENT or scene.pictured_elsewhere is not None:
+            elif variant.kind != ABSENT or _is_as_sharp(scene.pictured_elsewhere, scene.pictured, variant.side_m):
                 found.append(variant)
         return tuple(found)
 
@@ -159,7 +160,7 @@ class RealImageSuite(Suite):
         is_one = shot.variant.kind != FRAMES
         side_m = _PICTURE * (shot.variant.side_m if is_one else FRAME_M)
         # As many pixels wherever it is taken: their number must not tell that it is of another town.
-        width_px = min(_MOST_PX, round(side_m / shot.scene.pictured.imagery.record.gsd_m))
+        width_px = _width_px(shot.scene.pictured, side_m)
         # Of several frames each shows less, and they lie around the last one.
         stops = [
             Pose(easting_m=FRAME_M / 2 * right, northing_m=FRAME_M / 2 * ahead, yaw_deg=0.0)
@@ -207,6 +208,19 @@ def _is_shown(pictured: PicturedGround, pose: Pose, variants: Sequence[Variant])
     sides_m = sorted({side_m for variant in variants for side_m in (variant.side_m, _PICTURE * variant.side_m)})
     is_within = all(pictured.shows_corners(pose, side_m) for side_m in sides_m)
     return is_within and all(pictured.shown_share(pose, side_m) >= LEAST_SHOWN for side_m in sides_m)
+
+
+def _width_px(pictured: PicturedGround, side_m: float) -> int:
+    return min(_MOST_PX, round(side_m / pictured.imagery.record.gsd_m))
+
+
+def _is_as_sharp(other: PicturedGround | None, pictured: PicturedGround, side_m: float) -> bool:
+    """Return whether pictures for a view show the ground of another region as sharply as their own."""
+    if other is None:
+        return False
+    shown_m = _PICTURE * side_m
+    pixel_m = max(pictured.own_gsd_m, shown_m / _width_px(pictured, shown_m))
+    return other.own_gsd_m <= _MOST_BLUR * pixel_m
 
 
 def _measured(pictured: PicturedGround, cuts: Sequence[Cut]) -> dict[str, float]:
@@ -339,7 +353,7 @@ class RealFlightSuite(FlightSuite):
         variant, pictured = shot.variant, shot.scene.pictured
         assert pictured is not None  # noqa: S101 - by `lack`
         side_m = _PICTURE * variant.side_m
-        cut = pictured.cut(shot.site.pose, side_m, min(_MOST_PX, round(side_m / pictured.imagery.record.gsd_m)))
+        cut = pictured.cut(shot.site.pose, side_m, _width_px(pictured, side_m))
         classes = pictured.state.classes
         return QueryDraft(
             evidence=unseen(classes, variant.view_cells, variant.cell_size_m),

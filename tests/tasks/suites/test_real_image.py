@@ -156,19 +156,30 @@ def test_no_view_is_larger_than_the_region_allows_and_each_is_drawn_once(largest
     assert any(item.kind == DEGRADED for item in fitting)
 
 
+def of_own_pixels(pictured: PicturedGround, gsd_m: float) -> PicturedGround:
+    record = pictured.imagery.record
+    pictures = tuple(item.model_copy(update={"gsd_m": gsd_m}) for item in record.pictures)
+    record = record.model_copy(update={"pictures": pictures})
+    return replace(pictured, imagery=replace(pictured.imagery, record=record))
+
+
 def test_a_picture_of_coarse_pixels_is_asked_no_small_view_and_one_too_coarse_none(village):
     pictured = village.pictured()
 
     def of_pixels(gsd_m):
-        record = pictured.imagery.record
-        pictures = tuple(item.model_copy(update={"gsd_m": gsd_m}) for item in record.pictures)
-        record = record.model_copy(update={"pictures": pictures})
-        return scene_of(replace(pictured, imagery=replace(pictured.imagery, record=record)))
+        return scene_of(of_own_pixels(pictured, gsd_m))
 
     suite = replace(REAL_IMAGE, variants=REAL_IMAGE.fitting(192.0))
     assert {item.side_m for item in suite.usable(of_pixels(0.9))} == {192.0, 128.0, 96.0}
     assert {item.side_m for item in suite.usable(of_pixels(1.2))} == {192.0, 128.0}
     assert suite.lack(of_pixels(2.0)) == "its picture has pixels of 2 m, fewer than 100 along a view of 192 m"
+
+
+@pytest.mark.parametrize(("own_m", "other_m", "is_asked"), [(0.5, 0.5, True), (0.75, 0.5, True), (0.5, 0.85, False)])
+def test_no_picture_of_another_town_is_asked_that_its_blur_would_tell(own_m, other_m, is_asked, village):
+    pictured = village.pictured()
+    scene = scene_of(of_own_pixels(pictured, own_m), of_own_pixels(pictured, other_m))
+    assert (ABSENT in {item.kind for item in suite_on(scene).variants}) == is_asked
 
 
 def test_every_older_map_is_searched_at_the_same_sites_and_none_that_is_degraded(over):

@@ -8,7 +8,6 @@ from typing import Final, Self
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.special import logit
 
 from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
@@ -156,7 +155,8 @@ class Evidence:
         [[[7.6, -7.6, 0.0]]]
         """
         edge = 1 / (4 * LEVELS)
-        return np.asarray(logit(np.clip(np.nan_to_num(self.probabilities(), nan=_HALF), edge, 1 - edge)))
+        chances = np.clip(np.nan_to_num(self.probabilities(), nan=_HALF), edge, 1 - edge)
+        return np.asarray(np.log(chances / (1 - chances)))
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -62,9 +62,8 @@ def write_tables(folder: Path, features: "gpd.GeoDataFrame", graph: MapGraph, *,
         features = features.iloc[np.argsort(features.hilbert_distance().to_numpy(), kind="stable")]
     geographic = {**CHECKED, "schema_version": "1.1.0", "row_group_size": GROUP_ROWS}
     origin: Mapping[Any, Any] = {"attribution": credit, "licence": LICENCE}
-    _attributed(features.reset_index(drop=True), origin).to_parquet(
-        folder / FEATURES, write_covering_bbox=True, **geographic
-    )
+    geometric = _attributed(features.reset_index(drop=True), origin)
+    geometric.to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
     _attributed(graph.nodes, origin).to_parquet(folder / NODES, **geographic)
     write_frame(graph.edges, folder / EDGES, attrs=origin)
 

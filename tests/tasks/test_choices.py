@@ -58,8 +58,8 @@ def test_places_of_trials_keep_their_names_and_countries_and_are_drawn_by_hash()
     files = list_region_files()
     area_m2 = {}
     for name in TRAIN:
-        width_m, height_m = read_region_file(files[name]).size_m
-        area_m2[name] = width_m * height_m
+        grid = read_region_file(files[name]).grid()
+        area_m2[name] = grid.rows * grid.cols * grid.cell_size_m**2
     for country in set(TRAIN.values()):
         own = [name for name in TRAIN if TRAIN[name] == country]
         small = [name for name in own if area_m2[name] <= LARGE_M2] or [min(own, key=area_m2.__getitem__)]

@@ -6,7 +6,9 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from threading import Timer
+from threading import Thread, get_ident
+from time import sleep
+from traceback import walk_stack
 from types import FrameType
 from typing import TYPE_CHECKING, Final
 
@@ -37,7 +39,17 @@ def interrupted_by_signals() -> Iterator[None]:
             print_dropped(dropped)
             return
         number = _received[-1] if _received else signal.SIGINT
-        Timer(_PAUSE_S, os.kill, (os.getpid(), number)).start()
+        Thread(target=send, args=(number, get_ident()), daemon=True).start()
+
+    def send(number: int, thread: int) -> None:
+        """Send a signal once the hook has returned, however busy the machine is: what is raised in it is lost."""
+        is_inside = True
+        while is_inside:
+            sleep(_PAUSE_S)
+            frame = sys._current_frames().get(thread)  # noqa: SLF001 - documented
+            stack = [] if frame is None else [each.f_code for each, _ in walk_stack(frame)]
+            is_inside = send_again.__code__ in stack
+        os.kill(os.getpid(), number)
 
     print_dropped = sys.unraisablehook
     sys.unraisablehook = send_again

@@ -355,6 +355,7 @@ def test_frames_lie_around_the_last_one_which_is_the_view_alone(over):
 # --- flights
 
 
+@pytest.mark.slow
 def test_a_flight_over_a_mosaic_stays_on_it_and_shows_where_its_truths_are(village):
     request = request_of(village.spec, village.out, village.folder, suite="flight-real-image", count=2)
     (task,) = make_tasks(request)

@@ -48,16 +48,19 @@ def joined_answer(found: sgb.Segmentation) -> sgb.Segmentation:
     return sgb.Segmentation.of_probabilities((*found.classes, ROAD), np.concatenate([chances, road]))
 
 
+def part_of(region: sgb.Region, box: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return west, south, east, north of a part of a region's picture, metres; `box` is west, east, north, south."""
+    west, south, east, north = region.imagery.record.bounds_m
+    left, right, top, bottom = box
+    width, height = east - west, north - south
+    return west + left * width, north - bottom * height, west + right * width, north - top * height
+
+
 def counted(segmenter: sgb.Segmenter, region: sgb.Region, box: Sequence[float]) -> Iterator[PixelCounts]:
     """Yield the counts of each view of a part of a region's picture."""
     if region.imagery is None:
         raise SystemExit(f"{region.manifest.id} has no imagery: name a region whose file has [[imagery]]")
-    west, south, east, north = region.imagery.record.bounds_m
-    bounds = (
-        *(west + box[0] * (east - west), north - box[3] * (north - south)),
-        *(west + box[1] * (east - west), north - box[2] * (north - south)),
-    )
-    views = region_views(region, bounds, place=region.manifest.id, gsd_m=GSD_M, side_px=SIDE_PX)
+    views = region_views(region, part_of(region, box), place=region.manifest.id, gsd_m=GSD_M, side_px=SIDE_PX)
     for number, view in enumerate(views):
         found = joined_answer(segmenter.segment(view.image, learned=None))
         yield PixelCounts.of(joined_labels(view), found, image=str(number))

@@ -34,6 +34,7 @@ from torch import nn
 from torch.nn import functional
 
 import sasgeo_bench as sgb
+from benchmarks.real_pictures import part_of
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.scoring.segmentation import PixelCounts
 from sasgeo_bench.sensing.crops import Crop, drawn_crops, real_crops
@@ -184,14 +185,6 @@ class Source:
         return real_crops(self.regions, **shape, bounds_m=part_of(self.regions[0], self.box))
 
 
-def part_of(region: sgb.Region, box: Sequence[float]) -> tuple[float, float, float, float]:
-    """Return west, south, east, north of a part of a region's picture, metres; `box` is of `WHOLE`."""
-    west, south, east, north = region.imagery.record.bounds_m
-    left, right, top, bottom = box
-    width, height = east - west, north - south
-    return west + left * width, north - bottom * height, west + right * width, north - top * height
-
-
 def sources_of(drawn: Sequence[str], real: Sequence[str], drawn_share: float, out: Path) -> list[Source]:
     """Return sources: real ones share what is not drawn by the roots of their areas."""
     boxes = {
@@ -277,7 +270,7 @@ def train(sources: Sequence[Source], path: Path, given: argparse.Namespace) -> N
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
     net = Net().to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(net.parameters(), lr=given.rate, weight_decay=DECAY)
-    done = 0
+    done, steps = 0, math.ceil(given.steps / PART) * PART
     if given.begin is not None and not path.exists():
         net.load_state_dict(torch.load(given.begin, weights_only=True)["net"])
     if path.exists():
@@ -287,11 +280,11 @@ def train(sources: Sequence[Source], path: Path, given: argparse.Namespace) -> N
         done = state["done"]
     began = time.perf_counter()
     net.train()
-    while done < given.steps:
+    while done < steps:
         total = 0.0
         for planes, wanted, weights in batches(sources, done // PART, given.batch):
             for group in optimizer.param_groups:
-                group["lr"] = given.rate * min((done + 1) / RISE, 1) * (1 + math.cos(math.pi * done / given.steps)) / 2
+                group["lr"] = given.rate * min((done + 1) / RISE, 1) * (1 + math.cos(math.pi * done / steps)) / 2
             with torch.autocast("cpu", torch.bfloat16):
                 found = net(planes.to(memory_format=torch.channels_last))
             loss = loss_of(found.float(), wanted, weights)
@@ -301,9 +294,7 @@ def train(sources: Sequence[Source], path: Path, given: argparse.Namespace) -> N
             optimizer.step()
             total += float(loss.detach())
             done += 1
-        print(
-            f"{done} of {given.steps} steps in {time.perf_counter() - began:.0f} s, loss {total / PART:.3f}", flush=True
-        )
+        print(f"{done} of {steps} steps in {time.perf_counter() - began:.0f} s, loss {total / PART:.3f}", flush=True)
         torch.save(
             {"net": net.state_dict(), "optimizer": optimizer.state_dict(), "done": done}, path.with_suffix(".new")
         )

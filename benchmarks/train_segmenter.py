@@ -30,6 +30,7 @@ import torch
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from sasgeo_baselines.segmenters.osm_unet import CLASSES, WEIGHTS, OsmUNet, normalized
+from scipy.special import expit
 from torch import nn
 from torch.nn import functional
 
@@ -54,6 +55,7 @@ LEAST_CELLS: Final = 2000  # of a class in a step: fewer weigh less
 EDGE: Final = 0.4  # weight of a cell at an edge: maps lie 1 to 3 m off
 BARE: Final = 0.25  # of the absence of an area class where the map has nothing at all: nobody may have mapped it
 AREAS: Final = frozenset({"green", "farmland", "parking", "bare"})
+SHADED: Final = 0.15  # of real crops: steep valleys are half in the shade
 HALF_FROM: Final = 16  # numbers of an array that is stored in half precision
 
 # Maps that are drawn: one place at least of each train country of the split `world`, but those under pictures.
@@ -159,11 +161,21 @@ def varied(rgb: Pixels, rng: np.random.Generator) -> Pixels:
     if rng.random() < 0.15:
         axis, slopes = np.linspace(-1, 1, side), rng.normal(0, 0.15, 2)
         seen = seen * (1 + slopes[0] * axis[:, None, None] + slopes[1] * axis[None, :, None])
+    if rng.random() < SHADED:
+        seen = seen * (1 - shade(side, rng)[..., None] * rng.uniform((0.4, 0.35, 0.2), (0.8, 0.75, 0.6)))
     found = np.asarray(np.clip(seen, 0, 1) * 255, dtype=np.uint8)
     if rng.random() < 0.4:
         _, packed = cv2.imencode(".jpg", found, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 90))])
         found = np.asarray(cv2.imdecode(packed, cv2.IMREAD_COLOR), dtype=np.uint8)
     return found
+
+
+def shade(side: int, rng: np.random.Generator) -> Planes:
+    """Return how much the shade of a slope or a tower covers each pixel, 0 to 1, shape (side, side)."""
+    axis, turn = np.linspace(-1, 1, side, dtype=np.float32), rng.uniform(0, 2 * np.pi)
+    ragged = cv2.resize(rng.normal(0, 0.15, (9, 9)).astype(np.float32), (side, side), interpolation=cv2.INTER_CUBIC)
+    beyond = np.cos(turn) * axis[None] + np.sin(turn) * axis[:, None] + ragged - rng.uniform(-0.7, 0.7)
+    return np.asarray(expit(beyond / rng.uniform(0.01, 0.1)), dtype=np.float32)
 
 
 @dataclass(frozen=True)

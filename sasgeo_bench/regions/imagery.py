@@ -197,6 +197,12 @@ class Imagery:
         """Return the lattice of the pixels."""
         return self.record.grid(epsg=self.epsg)
 
+    @property
+    def off_m(self) -> tuple[float, float]:
+        """Return how far east and north of its place on the map a thing is seen, metres; 0 where not measured."""
+        offset = self.record.offset
+        return (offset.east_m, offset.north_m) if offset else (0.0, 0.0)
+
     def check(self) -> None:
         """Raise `StoreError` if the file is missing or differs from its record in `region.json`."""
         if not self.path.is_file() or file_record(self.path) != self.file:

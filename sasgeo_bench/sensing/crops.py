@@ -317,8 +317,7 @@ class _Picture:
             raise ConfigError(f"{region.manifest.id} has no real imagery: build it with imagery, or take drawn_crops")
         self._region, self._shape, self._imagery = region, shape, region.imagery
         self._paint = make_paint(region.features, region.classes, region.coverage)
-        offset = self._imagery.record.offset
-        self._off_m = (offset.east_m, offset.north_m) if offset else (0.0, 0.0)
+        self._off_m = self._imagery.off_m
         west, south, east, north = self._imagery.record.bounds_m
         shown = (west - self._off_m[0], south - self._off_m[1], east - self._off_m[0], north - self._off_m[1])
         self._within_m = _common(_common(shown, region.grid.bounds_m), bounds_m or shown)

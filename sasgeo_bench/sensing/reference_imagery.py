@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -78,7 +78,7 @@ def region_views(
     region : Region
         A region with imagery.
     bounds_m : tuple of float
-        West, south, east, north of the part, metres in the region's CRS.
+        West, south, east, north of the part of the picture, metres in the region's CRS.
     place : str
         Place of the labelled images.
     gsd_m, side_px : float, int
@@ -92,8 +92,9 @@ def region_views(
 
     Notes
     -----
-    Labels are burned from the features at the pixels of the view. They are UNKNOWN outside the mapped area and where
-    the imagery has no data. Views of which less than `LEAST_LABELLED` is known are left out.
+    Labels are burned from the features at the pixels of the view; the offset of the imagery against the map is taken
+    off where it was measured. They are UNKNOWN outside the mapped area and where the imagery has no data. Views of
+    which less than `LEAST_LABELLED` is known are left out.
 
     Examples
     --------
@@ -120,7 +121,8 @@ def _strips(total: int, side: int) -> Iterator[tuple[int, int]]:
 
 def _view(imagery: Imagery, classes: tuple[str, ...], paint: Paint, grid: Grid, place: str) -> LabelledImage:
     shown = imagery.read(grid.bounds_m, gsd_m=grid.cell_size_m)
-    labels = burn_layers(paint, grid)
+    right_m, up_m = imagery.off_m
+    labels = burn_layers(paint, replace(grid, west_m=grid.west_m - right_m, north_m=grid.north_m - up_m))
     labels[(labels == OUTSIDE) | ~shown.is_known] = UNKNOWN
     focal_px = _FAR_M / grid.cell_size_m
     lens = Intrinsics(

@@ -47,10 +47,9 @@ class PicturedGround:
     imagery: Imagery
 
     @property
-    def off_m(self) -> Floats:
-        """Return how far east and north of its place on the map a thing is seen, shape (2,); 0 where not measured."""
-        offset = self.imagery.record.offset
-        return np.zeros(2) if offset is None else np.array((offset.east_m, offset.north_m))
+    def off_m(self) -> tuple[float, float]:
+        """Return how far east and north of its place on the map a thing is seen, metres; 0 where not measured."""
+        return self.imagery.off_m
 
     @property
     def own_gsd_m(self) -> float:

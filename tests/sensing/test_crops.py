@@ -277,7 +277,7 @@ class HalfShown:
     """Imagery of which the east was not photographed."""
 
     def __init__(self, imagery):
-        self._imagery, self.record = imagery, imagery.record
+        self._imagery, self.record, self.off_m = imagery, imagery.record, imagery.off_m
 
     def read(self, bounds_m, *, gsd_m=None):
         window = self._imagery.read(bounds_m, gsd_m=gsd_m)

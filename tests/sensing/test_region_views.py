@@ -11,6 +11,7 @@ import shapely
 
 from sasgeo_bench.core.errors import ImageryError
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.regions.imagery import OffsetRecord
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sensing.reference_imagery import part_bounds_m, region_views, split_bounds
 from tests import world
@@ -57,6 +58,26 @@ def test_labels_are_what_is_mapped_at_each_pixel_of_the_view(region, hamlet):
     house = shapely.union_all(hamlet.houses)
     is_house = shapely.contains_xy(house, *np.meshgrid(east_m, north_m))
     assert ((one.labels[0] == PRESENT) == is_house).mean() > 0.99
+
+
+def test_the_measured_offset_of_the_imagery_is_taken_off_the_labels(region):
+    inside = (WEST + 64.0, SOUTH + 64.0, WEST + 320.0, SOUTH + 320.0)
+    off = OffsetRecord(
+        east_m=2.0, north_m=-1.0, east_interval_m=(2.0, 2.0), north_interval_m=(-1.0, -1.0), residual_m=0.0, tiles=9
+    )
+    plain, moved = (
+        np.block([[one.labels[0] for one in row] for row in np.array_split(np.array(views(one, inside)), 4)])
+        for one in (with_offset(region, None), with_offset(region, off))
+    )
+    down, right = round(1.0 / GSD_M), round(2.0 / GSD_M)
+    assert (moved[down:, right:] == plain[:-down, :-right]).all()
+    assert (moved != plain).any()
+
+
+def with_offset(region, offset):
+    """Return a region whose imagery says that it is off its map."""
+    record = region.imagery.record.model_copy(update={"offset": offset})
+    return replace(region, imagery=replace(region.imagery, record=record))
 
 
 def test_beyond_the_mapped_area_labels_are_unknown_and_views_of_nothing_are_left_out(region):

@@ -127,7 +127,8 @@ def trains(split: Split, region: str) -> bool:
 def needed(requests: Sequence[Request], learning: LearningSpec | None) -> tuple[Request, ...]:
     """Return the requests that are learned from or asked: on train places of a hold-out only suites to learn from.
 
-    Those are the suites of `learning`, and rendered pictures, which segmenters learn from. Raise `ConfigError` if learning from a hold-out has no train or no test place, or a region of several parts.
+    Those are the suites of `learning`, and rendered pictures, which segmenters learn from. Raise `ConfigError` if
+    learning from a hold-out has no train or no test place, or a region of several parts.
     """
     taught = {name.partition(BY)[0] for name in (() if learning is None else learning.suites)}
     found = tuple(

@@ -5,7 +5,14 @@ import cv2
 import numpy as np
 import pytest
 from sasgeo_baselines.segmenters import osm_unet
-from sasgeo_baselines.segmenters.osm_unet import CLASSES, WEIGHTS, OsmUNet, normalized
+from sasgeo_baselines.segmenters.osm_unet import (
+    CLASSES,
+    HELD_OUT_WEIGHTS,
+    WEIGHTS,
+    OsmUNet,
+    OsmUNetHeldOut,
+    normalized,
+)
 
 import sasgeo_bench as sgb
 from sasgeo_bench.running.segmenter_testing import check_segmenter
@@ -36,15 +43,22 @@ def chances(image):
     return OsmUNet().segment(image, learned=None).probabilities()
 
 
-def test_the_weights_are_small_and_the_card_names_what_taught_them():
-    assert WEIGHTS.stat().st_size <= 3e6
-    assert OsmUNet.card.trained_on
-    assert OsmUNet.card.classes == CLASSES
+def test_the_weights_are_small_and_the_cards_name_what_taught_them():
+    assert max(path.stat().st_size for path in (WEIGHTS, HELD_OUT_WEIGHTS)) <= 3e6
+    assert OsmUNet.card.classes == OsmUNetHeldOut.card.classes == CLASSES
+    assert set(OsmUNet.card.trained_on) > set(OsmUNetHeldOut.card.trained_on)
 
 
-def test_the_kit_finds_no_fault():
-    faults = [check for check in check_segmenter("osm_unet") if check.outcome == "fail"]
+@pytest.mark.parametrize("name", ["osm_unet", "osm_unet_held_out"])
+def test_the_kit_finds_no_fault(name):
+    faults = [check for check in check_segmenter(name) if check.outcome == "fail"]
     assert not faults
+
+
+def test_what_was_kept_back_changes_what_is_seen():
+    image = ortho(patchwork(256), 0.5)
+    first, second = (kind().segment(image, learned=None).probabilities() for kind in (OsmUNet, OsmUNetHeldOut))
+    assert 0.01 < np.abs(first - second).mean() < 0.2
 
 
 def test_exposure_haze_and_holes_change_nothing_that_the_network_sees():

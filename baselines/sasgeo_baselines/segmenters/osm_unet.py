@@ -137,7 +137,8 @@ def _log_odds(network: cv2.dnn.Net, planes: Plane, *, is_mirrored: bool) -> Plan
     padded = np.pad(planes, ((0, 0), (0, -rows % MULTIPLE), (0, -cols % MULTIPLE)), mode="symmetric")
     found = _by_tiles(network, padded)
     if is_mirrored:
-        found = (found + _by_tiles(network, padded[:, :, ::-1])[:, :, ::-1]) / 2
+        found += _by_tiles(network, padded[:, :, ::-1])[:, :, ::-1]
+        found /= 2
     # Cells of padding are cut, but for one that a picture of odd sides shares with it.
     return found[:, : -(-rows // _STEP_PX), : -(-cols // _STEP_PX)]
 

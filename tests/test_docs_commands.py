@@ -61,7 +61,7 @@ ONLY_PARSED = {
     r"FILE\.json|<hash>": "needs what a matcher has learnt",
     r"HASH|--query ID": "needs a run or a query of the reader's own; tests/boards/test_board_pictures.py does it",
     r"out/boards/demo": "needs the board of the demo; tests/boards/test_publish.py publishes small ones",
-    r"^sasgeo-bench build-region \S+-ortho$": "needs an extract and a picture",
+    r"^sasgeo-bench (build-region|make-queries) .*-ortho": "needs an extract and a picture",
     r"^sasgeo-bench verify crossfit": "minutes: tests/cli/test_cli_queries.py does it",
     r"^sasgeo-bench (import|locate)-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
     r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",

@@ -128,9 +128,9 @@ def _request_sha256(request: Request) -> str:
         "region": request.region.model_dump(mode="json"),
         "elsewhere": request.elsewhere and request.elsewhere.model_dump(mode="json"),
         # Halves decide only where methods train, countries how rows cluster: changing them redraws nothing. What is
-        # sealed has its own seed.
+        # sealed has its own seed. Who lends its imagery is `elsewhere`.
         "split": request.split.spec.model_dump(
-            mode="json", exclude={"place": {"__all__": {"half", "country", "sealed"}}}
+            mode="json", exclude={"place": {"__all__": {"half", "country", "sealed"}}, "lends": True}
         ),
         "count": [request.count, request.may_be_fewer],
         "seed": request.seed if isinstance(request.seed, int) else request.seed.commitment,
@@ -252,7 +252,8 @@ def _pictured_elsewhere(request: Request) -> PicturedGround | None:
     folder = _built(request, request.elsewhere, None)
     there = region_files.read_region(folder, with_layers=False)
     state = State.of(there, bits=read_bits(folder / region_files.LAYERS))
-    return _pictured(there, state.of_classes(request.region.class_names))
+    # A map that knows of fewer classes labels those alone: the others are unknown on its pictures.
+    return _pictured(there, state.of_classes([name for name in request.region.class_names if name in there.classes]))
 
 
 def look_of(split: Split, block: Block) -> Family:

@@ -66,7 +66,13 @@ class Place(Document):
 
 
 class SplitFile(NamedDocument):
-    """Contents of a file in `splits/`."""
+    """Contents of a file in `splits/`.
+
+    `lends` are regions beside its places whose imagery serves for views of another town where no place has any:
+    nothing is drawn on their maps, learned from them or calibrated on them.
+    """
+
+    without_empty: ClassVar = frozenset({"lends"})
 
     id: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$")]
     title: Line
@@ -75,6 +81,14 @@ class SplitFile(NamedDocument):
     block_m: Annotated[float, Field(ge=100, le=20_000)] = 1000.0
     reach_m: Annotated[float, Field(ge=0, le=5000)] = 360.0
     place: Annotated[list[Place], Field(min_length=2)]
+    lends: list[str] = []
+
+    @model_validator(mode="after")
+    def _lends_beside_its_places(self) -> Self:
+        asked = next((region for region in self.lends if region in self.region_ids), None)
+        if asked is not None:
+            raise ValueError(f"region {asked!r} stands under 'lends' and in a place: take it out of one of them")
+        return self
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
@@ -283,7 +297,7 @@ def make_split(spec: SplitFile, grids: Mapping[str, Grid]) -> Split:
         If a region or block is unknown, a block is in two places, or blocks of two parts are nearer than the buffer and
         the reach of the queries' footprints allow.
     """
-    unknown = [region for region in spec.region_ids if region not in grids]
+    unknown = [region for region in (*spec.region_ids, *spec.lends) if region not in grids]
     if unknown:
         own = "list regions shows all that ship; --region-files names a folder of your own"
         mend = "a block stands under 'blocks'" if "/" in unknown[0] else own

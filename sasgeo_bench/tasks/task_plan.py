@@ -139,12 +139,24 @@ def plan_requests(wanted: TaskRequest) -> tuple[Request, ...]:
             suite_spec=spec,
             region=item,
             split=split,
-            elsewhere=wrong_place(split, item, known, is_pictured="another picture" in suite.card.needs),
+            elsewhere=_elsewhere(wanted, suite, split, item, known),
             **settings | ({"seed": wanted.sealed_seed} if split.sealed_place(item.id) else {}),
         )
         for item in _without_sealed({item.id: item for item in named}, split, wanted)
         for spec, suite in suites.items()
     )
+
+
+def _elsewhere(
+    wanted: TaskRequest, suite: Suite, split: Split, region: RegionFile, known: Mapping[str, RegionFile]
+) -> RegionFile | None:
+    """Return the region for views of a wrong place; None for want of its picture on this machine, and tell so."""
+    is_pictured = "another picture" in suite.card.needs
+    found = wrong_place(split, region, known, is_pictured=is_pictured)
+    if found is None or not (is_pictured and region.imagery) or is_reachable(found, wanted.extract_folders, wanted.out):
+        return found
+    tell(f"{suite.card.name} on {region.id}: {found.id} is not on this machine, so no view is of another town")
+    return None
 
 
 def _other_split(region: str) -> str:
@@ -219,7 +231,8 @@ def wrong_place(
 
     With `is_pictured` it is a region with imagery, which may be passed on if the region's own may. Few places have
     some: in a hold-out where no other of the same part has, it is of a train place, from whose pictures anybody may
-    learn.
+    learn; then one that the split names to lend its imagery; and then one whose map knows of fewer classes, for a
+    segmenter sees all of them on any picture.
     """
     places = split.spec.place
     at = next((index for index, place in enumerate(places) if region.id in place.region_ids), None)
@@ -229,19 +242,22 @@ def wrong_place(
     others = [split.spec.place[(at + step) % len(places)] for step in range(1, len(places))]
     allowed = [item for item in others if not item.sealed and not (own.country and item.country == own.country)]
     parts = (own.part, "train") if is_pictured else (own.part,)
-    fitting = [
-        known[name]
-        for part in dict.fromkeys(parts)
-        for place in allowed
-        if place.part == part
-        for name in place.region_ids
-        if name in known and set(region.class_names) <= set(known[name].class_names)
-        if not is_pictured or _lends_picture(known[name], region)
+    names = [
+        name for part in dict.fromkeys(parts) for place in allowed if place.part == part for name in place.region_ids
     ]
+    if is_pictured:
+        there = [known[name] for name in (*names, *split.spec.lends) if name in known]
+        lent = [one for one in there if _lends_picture(one, region)]
+        return next((one for one in lent if _knows_all_of(region, one)), lent[0] if lent else None)
+    fitting = [known[name] for name in names if name in known and _knows_all_of(region, known[name])]
     alike = [one for one in fitting if _is_town(one) == _is_town(region)]
     if not alike and region.classes is not None:
         alike = fitting
     return alike[0] if alike else None
+
+
+def _knows_all_of(region: RegionFile, other: RegionFile) -> bool:
+    return set(region.class_names) <= set(other.class_names)
 
 
 def _lends_picture(other: RegionFile, region: RegionFile) -> bool:

@@ -30,7 +30,8 @@ RIVERSIDE = "town-riverside"
 @pytest.fixture(autouse=True)
 def _no_extracts(monkeypatch, tmp_path):
     """What is planned does not depend on what lies on this machine."""
-    monkeypatch.delenv("SASGEO_EXTRACTS", raising=False)
+    for name in ("SASGEO_EXTRACTS", "SASGEO_IMAGERY"):
+        monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
@@ -213,6 +214,48 @@ def test_a_wrong_picture_is_of_the_same_part_or_a_train_place(region, with_pictu
     files = pictured(known, *with_pictures)
     other = wrong_place(split, files[region], files, is_pictured=True)
     assert (other and other.id) == expected
+
+
+def lending(tmp_path, known, *lends: str):
+    lines = ['id = "mine"\ntitle = "Mine"\nkind = "crossfit"\nbuffer_m = 0.0', f"lends = {list(lends)}"]
+    for name, half in (("vaduz", "a"), ("porto", "b"), ("munich", "a"), ("lauf", "b")):
+        lines.append(f'[[place]]\nname = "{name}"\nregions = ["{name}"]\nhalf = "{half}"')
+    (tmp_path / "mine.toml").write_text("\n".join(lines) + "\n")
+    return make_split(read_split_file(tmp_path / "mine.toml"), {name: item.grid() for name, item in known.items()})
+
+
+def test_a_region_beside_the_split_lends_its_picture_where_no_place_has_one(known, tmp_path):
+    split = lending(tmp_path, known, "krems")
+    for there, expected in (("porto", "krems"), "porto"), (("krems",), "krems"), (("helsinki",), None):
+        found = wrong_place(split, known["vaduz"], pictured(known, *there), is_pictured=True)
+        assert (found and found.id) == expected
+    assert wrong_place(split, known["vaduz"], known).id == "porto"  # views of maps stay among the places
+    assert "krems" not in split.spec.region_ids
+
+
+def test_a_lender_is_a_known_region_beside_the_places(known, tmp_path):
+    with pytest.raises(ConfigError, match="region 'porto' stands under 'lends' and in a place: take it out of one"):
+        lending(tmp_path, known, "porto")
+    with pytest.raises(ConfigError, match="names the unknown region 'atlantis'"):
+        lending(tmp_path, known, "atlantis")
+
+
+def test_a_picture_over_a_map_of_fewer_classes_is_lent_where_there_is_no_other(known, tmp_path):
+    split = lending(tmp_path, known)
+    few = {name: item.model_copy(update={"classes": ["building"]}) for name, item in known.items() if name == "porto"}
+    for there, expected in (("porto",), "porto"), (("porto", "munich"), "munich"):
+        found = wrong_place(split, known["vaduz"], pictured(known | few, *there), is_pictured=True)
+        assert found.id == expected
+
+
+def test_a_picture_that_is_not_on_this_machine_is_not_asked_for_and_that_is_told(tmp_path):
+    lines: list[str] = []
+    with reporting(lines.append):
+        (request,) = plan(tmp_path, suites=("real-image",), regions=("chateaugiron-ortho",), split="world")
+    assert request.elsewhere is None
+    assert lines == [
+        "real-image on chateaugiron-ortho: pardubice-ortho is not on this machine, so no view is of another town"
+    ]
 
 
 def test_a_picture_that_must_not_be_passed_on_is_not_lent_to_one_that_may(known, tmp_path):

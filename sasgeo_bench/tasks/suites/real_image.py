@@ -12,6 +12,7 @@ from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.sensing.accumulation import believed_steps, steps_between
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
+from sasgeo_bench.sensing.sharpness import no_sharper
 from sasgeo_bench.tasks.frame_evidence import poses_before
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.pictured_ground import GROUNDS, Cut, PicturedGround
@@ -26,10 +27,11 @@ MAIN_M: Final = 192.0  # of the view by which sites are chosen and kept apart
 DISC_M: Final = 250.0  # of the second disc; the first is that of the card
 LEAST_SHOWN: Final = 0.97  # of a view, and of its picture, at every site
 LEAST_PX: Final = 100  # of the picture's own pixels along the side of a view
-VIEW, DEGRADED, OLDER, ABSENT, FRAMES = (
+VIEW, DEGRADED, OLDER, OWN, ABSENT, FRAMES = (
     "R1 view",
     "R2 degraded map",
     "R3 map",
+    "R4 own town",
     "R4 another town",
     "R5 frames",
 )
@@ -42,7 +44,6 @@ _FINE_M: Final = 128.0  # widest view in fine cells
 _FINE_CELL_M: Final = 0.5
 _PICTURE: Final = 1.25  # times the view's side is what a picture shows
 _MOST_PX: Final = 768
-_MOST_BLUR: Final = 1.1  # times as wide as those of a view may pixels of another town be: its blur would tell it
 _HEIGHT_M: Final = 2000.0  # of the camera that a mosaic stands for: from there nothing leans
 _TRIES: Final = 4000
 
@@ -90,8 +91,9 @@ class RealImageSuite(Suite):
         return _of_sides(self.variants, fit or [min(SIDES_M)])
 
     def usable(self, scene: Scene) -> tuple[Variant, ...]:
-        """Return the variants that the picture resolves: R3 for each older map, R4 where there is one as sharp."""
+        """Return the variants that the picture resolves: R3 for each older map, R4 where both pictures do."""
         assert scene.pictured is not None  # noqa: S101 - by `lack`
+        coarser_m = math.inf if scene.pictured_elsewhere is None else _coarser_gsd_m(scene)
         least_m = LEAST_PX * scene.pictured.own_gsd_m
         there = {variant.side_m for variant in self.variants}
         older = [state for state in scene.others if state.date < scene.map.date]
@@ -100,7 +102,7 @@ class RealImageSuite(Suite):
         for variant in _of_sides(self.variants, resolved_m):
             if variant.kind == OLDER:
                 found += [replace(variant, kind=f"{_OF}{state.date}") for state in older]
-            elif variant.kind != ABSENT or _is_as_sharp(scene.pictured_elsewhere, scene.pictured, variant.side_m):
+            elif variant.kind not in (OWN, ABSENT) or variant.side_m >= LEAST_PX * coarser_m:
                 found.append(variant)
         return tuple(found)
 
@@ -133,18 +135,27 @@ class RealImageSuite(Suite):
         return scene.pictured.ground(pose, self.main_side_m) if _is_shown(scene.pictured, pose, self.variants) else None
 
     def draw(self, shot: ViewRequest) -> QueryDraft:
-        """Cut the pictures of a shot; their evidence is unknown until a segmenter has seen them."""
+        """Cut the pictures of a shot; their evidence is unknown until a segmenter has seen them.
+
+        Views of R4 are drawn in pairs of the own town's ground and another's, each no sharper than the other one.
+        """
         variant, here = shot.variant, shot.scene.pictured
         assert here is not None  # noqa: S101 - by `lack`
         is_here = variant.kind != ABSENT
-        pictured, site = (here, shot.site) if is_here else self._elsewhere(shot)
+        pictured, site = seen = (here, shot.site)
+        if variant.kind in (OWN, ABSENT):
+            elsewhere = self._elsewhere(shot)
+            (pictured, site), (beside, paired) = (seen, elsewhere) if is_here else (elsewhere, seen)
         pose = _turned(shot) if variant.kind == TURNED else site.pose
         cuts, believed = self.cuts(shot, pictured, pose)
-        classes = pictured.state.classes
+        if variant.kind in (OWN, ABSENT):
+            (other,), _ = self.cuts(shot, beside, paired.pose)
+            cuts = [replace(cut, rgb=no_sharper(cut.rgb, than=other.rgb)) for cut in cuts]
+        classes = here.state.classes
         return QueryDraft(
             evidence=unseen(classes, variant.view_cells, variant.cell_size_m),
             frames=tuple(_frame(cut, place, self.card) for cut, place in zip(cuts, believed, strict=True)),
-            labels=tuple(FrameLabels.of(classes, cut.labels) for cut in cuts),
+            labels=tuple(FrameLabels.of(pictured.state.classes, cut.labels) for cut in cuts),
             is_present=is_here,
             has_pose=is_here,
             pose=pose if is_here and pose is not site.pose else None,
@@ -159,8 +170,10 @@ class RealImageSuite(Suite):
         assert shot.scene.pictured is not None  # noqa: S101 - by `lack`
         is_one = shot.variant.kind != FRAMES
         side_m = _PICTURE * (shot.variant.side_m if is_one else FRAME_M)
-        # As many pixels wherever it is taken: their number must not tell that it is of another town.
-        width_px = _width_px(shot.scene.pictured, side_m)
+        # Views of R4 have as many pixels wherever they are taken: their number must not tell one of another town.
+        is_paired = shot.variant.kind in (OWN, ABSENT)
+        gsd_m = _coarser_gsd_m(shot.scene) if is_paired else shot.scene.pictured.imagery.record.gsd_m
+        width_px = _width_px(side_m, gsd_m)
         # Of several frames each shows less, and they lie around the last one.
         stops = [
             Pose(easting_m=FRAME_M / 2 * right, northing_m=FRAME_M / 2 * ahead, yaw_deg=0.0)
@@ -180,16 +193,19 @@ class RealImageSuite(Suite):
         assert here is not None  # noqa: S101 - by `lack`
         assert there is not None  # noqa: S101 - by `usable`
         wanted, state = here.ground(shot.site.pose, self.main_side_m), there.state
+        paired = [variant for variant in self.variants if variant.kind in (OWN, ABSENT)]
+        most_m = shot.scene.view_reach_m * max(one.side_m for one in paired) / max(one.side_m for one in self.variants)
         west, south, east, north = there.imagery.record.bounds_m
         found: Pose | None = None
         for point in shot.seeds.rng("elsewhere").uniform((west, south), (east, north), (_TRIES, 2)):
             pose = replace(shot.site.pose, easting_m=float(point[0]), northing_m=float(point[1]))
-            if not (_is_shown(there, pose, self.variants) and state.is_mapped(point, shot.scene.view_reach_m)):
+            is_alike = there.ground(pose, self.main_side_m) == wanted
+            if not (is_alike or found is None):
                 continue
-            found = found or pose
-            if there.ground(pose, self.main_side_m) == wanted:
+            if _is_shown(there, pose, paired) and state.is_mapped(point, most_m):
                 found = pose
-                break
+                if is_alike:
+                    break
         if found is None:
             raise ConfigError(f"{state.region} has no picture of a view to ask elsewhere: choose another split")
         return there, replace(shot.site, pose=found, density=there.drawn_share(found, self.main_side_m))
@@ -210,17 +226,14 @@ def _is_shown(pictured: PicturedGround, pose: Pose, variants: Sequence[Variant])
     return is_within and all(pictured.shown_share(pose, side_m) >= LEAST_SHOWN for side_m in sides_m)
 
 
-def _width_px(pictured: PicturedGround, side_m: float) -> int:
-    return min(_MOST_PX, round(side_m / pictured.imagery.record.gsd_m))
+def _width_px(side_m: float, gsd_m: float) -> int:
+    return min(_MOST_PX, round(side_m / gsd_m))
 
 
-def _is_as_sharp(other: PicturedGround | None, pictured: PicturedGround, side_m: float) -> bool:
-    """Return whether pictures for a view show the ground of another region as sharply as their own."""
-    if other is None:
-        return False
-    shown_m = _PICTURE * side_m
-    pixel_m = max(pictured.own_gsd_m, shown_m / _width_px(pictured, shown_m))
-    return other.own_gsd_m <= _MOST_BLUR * pixel_m
+def _coarser_gsd_m(scene: Scene) -> float:
+    """Return the ground resolution that both the region's picture and the other town's have."""
+    both = filter(None, (scene.pictured, scene.pictured_elsewhere))
+    return max(max(one.own_gsd_m, one.imagery.record.gsd_m) for one in both)
 
 
 def _measured(pictured: PicturedGround, cuts: Sequence[Cut]) -> dict[str, float]:
@@ -298,11 +311,12 @@ def _of_sides(variants: Iterable[Variant], sides_m: Sequence[float]) -> tuple[Va
 REAL_IMAGE: Final = RealImageSuite(
     card=SuiteCard(
         name="real-image",
-        version=2,
+        version=3,
         title="Real pictures (R)",
         what="Views of 384 to 96 m cut out of the imagery of a region, turned and scaled, in discs of 500 and 250 m: "
         "against its map as it is, by what they show (R1 built, mixed, open), without 20 % of its roofs, "
-        "the others 1.5 m off (R2), and as it was on each older date (R3); another town's picture (R4); 3 and 9 frames "
+        "the others 1.5 m off (R2), and as it was on each older date (R3); another town's picture, "
+        "and the own one beside it, each no sharper than the other (R4); 3 and 9 frames "
         "of 128 m, laid together by odometry that drifts by 1 % (R5). A segmenter makes the evidence.",
         separates="What is learned from rendered pictures from what real ones need.",
         falsifier="The picture turned by 90, 180 or 270 deg: scores as in the control.",
@@ -313,7 +327,7 @@ REAL_IMAGE: Final = RealImageSuite(
     variants=(
         *(_variant("control", "control", SIDES_M[0], disc_m=disc_m) for disc_m in (None, DISC_M)),
         *(_variant("stress", VIEW, side_m, disc_m=disc_m) for disc_m in (None, DISC_M) for side_m in SIDES_M),
-        *(_variant("stress", kind, side_m) for kind in (DEGRADED, ABSENT) for side_m in (256.0, 128.0)),
+        *(_variant("stress", kind, side_m) for kind in (DEGRADED, OWN, ABSENT) for side_m in (256.0, 128.0)),
         _variant("stress", OLDER, 256.0),
         *(_variant("stress", FRAMES, 256.0, strength=count) for count in COUNTS),
         _variant("falsifier", TURNED, SIDES_M[0]),
@@ -353,7 +367,7 @@ class RealFlightSuite(FlightSuite):
         variant, pictured = shot.variant, shot.scene.pictured
         assert pictured is not None  # noqa: S101 - by `lack`
         side_m = _PICTURE * variant.side_m
-        cut = pictured.cut(shot.site.pose, side_m, _width_px(pictured, side_m))
+        cut = pictured.cut(shot.site.pose, side_m, _width_px(side_m, pictured.imagery.record.gsd_m))
         classes = pictured.state.classes
         return QueryDraft(
             evidence=unseen(classes, variant.view_cells, variant.cell_size_m),

@@ -10,10 +10,12 @@ import pytest
 import rasterio
 import shapely
 from rasterio.windows import Window
+from scipy.ndimage import gaussian_filter
 
 from sasgeo_bench.core.errors import ConfigError, ImageryError
+from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.build import build_region, plan_build
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, observe
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, LayerBits, observe
 from sasgeo_bench.regions.imagery import OffsetRecord
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
@@ -21,16 +23,17 @@ from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import read_labels
-from sasgeo_bench.tasks.pictured_ground import BUILT, GROUNDS, OPEN, PicturedGround
+from sasgeo_bench.tasks.pictured_ground import BUILT, GROUNDS, OPEN, Cut, PicturedGround
 from sasgeo_bench.tasks.split import SplitFile, blocks_of, make_split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, ViewRequest
-from sasgeo_bench.tasks.suites.real_image import ABSENT, DEGRADED, FRAMES, OLDER, REAL_IMAGE, TURNED, VIEW
+from sasgeo_bench.tasks.suites.real_image import ABSENT, DEGRADED, FRAMES, OLDER, OWN, REAL_IMAGE, TURNED, VIEW
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.task_files import Task, read_queries, read_truths
 from sasgeo_bench.tasks.task_plan import Request
 from tests.regions import imagery_place
 from tests.regions.imagery_place import SOUTH, WEST, Hamlet, make_hamlet, write_houses, write_mosaic, write_picture
+from tests.sensing.test_sharpness import of_laplacian
 
 SIDE_M = 1536.0
 SHOWN_M = 960.0  # north of the southern rim a picture shows the village
@@ -175,11 +178,23 @@ def test_a_picture_of_coarse_pixels_is_asked_no_small_view_and_one_too_coarse_no
     assert suite.lack(of_pixels(2.0)) == "its picture has pixels of 2 m, fewer than 100 along a view of 192 m"
 
 
-@pytest.mark.parametrize(("own_m", "other_m", "is_asked"), [(0.5, 0.5, True), (0.75, 0.5, True), (0.5, 0.85, False)])
-def test_no_picture_of_another_town_is_asked_that_its_blur_would_tell(own_m, other_m, is_asked, village):
+@pytest.mark.parametrize(
+    ("own_m", "other_m", "expected"),
+    [
+        (0.5, 0.5, {192.0, 128.0}),
+        (0.75, 0.5, {192.0, 128.0}),
+        (0.5, 0.85, {192.0, 128.0}),
+        (0.5, 1.5, {192.0}),
+        (0.5, 2.0, set()),
+    ],
+)
+def test_another_town_and_the_own_one_are_asked_by_the_views_that_both_pictures_resolve(
+    own_m, other_m, expected, village
+):
     pictured = village.pictured()
     scene = scene_of(of_own_pixels(pictured, own_m), of_own_pixels(pictured, other_m))
-    assert (ABSENT in {item.kind for item in suite_on(scene).variants}) == is_asked
+    for kind in (OWN, ABSENT):
+        assert {item.side_m for item in suite_on(scene).variants if item.kind == kind} == expected
 
 
 def test_every_older_map_is_searched_at_the_same_sites_and_none_that_is_degraded(over):
@@ -300,14 +315,67 @@ def test_the_offset_of_the_imagery_is_taken_off(village):
 def test_a_view_of_another_town_says_no_pose_and_has_as_many_pixels(over):
     scene, sites = over
     site = sites[0]
-    one, other = (REAL_IMAGE.draw(shot_of(scene, site, kind, strength=128.0)) for kind in (VIEW, ABSENT))
+    one, other = (suite_on(scene).draw(shot_of(scene, site, kind, strength=128.0)) for kind in (OWN, ABSENT))
+    assert (one.is_present, one.has_pose, one.pose) == (True, True, None)
     assert (other.is_present, other.has_pose, other.pose) == (False, False, None)
     assert one.frames[0].camera == other.frames[0].camera
     assert one.frames[0].image().rgb.shape == other.frames[0].image().rgb.shape
     assert one.frames[0].picture != other.frames[0].picture
     assert {item.kind for item in suite_on(scene_of(scene.pictured)).variants} == {
         item.kind for item in suite_on(scene).variants
-    } - {ABSENT}
+    } - {OWN, ABSENT}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dull(PicturedGround):
+    """A place under a picture that says its pixels to be as wide, but is blurred."""
+
+    def cut(self, pose: Pose, side_m: float, width_px: int) -> Cut:
+        cut = super().cut(pose, side_m, width_px)
+        sigma_px = 1.2 * width_px / side_m
+        return replace(
+            cut, rgb=np.rint(gaussian_filter(cut.rgb.astype(float), (sigma_px, sigma_px, 0))).astype(np.uint8)
+        )
+
+
+@pytest.mark.parametrize("is_dull_here", [False, True])
+def test_the_variance_of_the_laplacian_does_not_tell_a_view_of_another_town(is_dull_here, village):
+    sharp = village.pictured()
+    dull = Dull(state=sharp.state, imagery=sharp.imagery)
+    here, there = (dull, sharp) if is_dull_here else (sharp, dull)
+    scene = scene_of(here, there)
+    suite = suite_on(scene)
+    pairs, before = [], []
+    for site in sites_of(scene, 8):
+        for side_m in (128.0, 192.0):
+            shots = [shot_of(scene, site, kind, strength=side_m) for kind in (OWN, ABSENT)]
+            pairs.append([of_laplacian(suite.draw(shot).frames[0].image().rgb) for shot in shots])
+            before.append([of_laplacian(one.cut(site.pose, 1.25 * side_m, 200).rgb) for one in (here, there)])
+    one, other = np.array(pairs).T
+    assert 0.35 < (one[:, None] > other[None, :]).mean() < 0.65
+    assert np.median(np.abs(np.log(one / other))) < 0.1
+    one, other = np.array(before).T
+    assert abs((one[:, None] > other[None, :]).mean() - 0.5) > 0.4
+
+
+def test_a_map_that_knows_of_fewer_classes_lends_its_picture_and_says_nothing_of_the_others(over):
+    scene, sites = over
+    state = scene.map
+    more = replace(
+        state,
+        classes=("water", *state.classes),
+        bits=LayerBits(bits=twice(state.bits.bits), count=len(state.classes) + 1),
+    )
+    wider = replace(scene, map=more, world=more, pictured=replace(scene.pictured, state=more))
+    draft = suite_on(wider).draw(shot_of(wider, sites[0], ABSENT))
+    assert draft.evidence.classes == more.classes
+    assert draft.labels[0].classes == state.classes
+
+
+def twice(bits: np.ndarray) -> np.ndarray:
+    """Return bits with an empty class in front."""
+    unknown = np.uint32(1 << 31)
+    return np.where(bits & unknown, unknown, bits << np.uint32(1))
 
 
 def test_the_kind_of_a_view_is_that_of_its_own_ground_and_its_group_that_of_its_disc(over):
@@ -450,6 +518,7 @@ def test_a_small_place_has_its_largest_view_in_both_discs_and_another_town_in_on
         ("r500-weak-s3", "control", 0.0): sites,
         ("r250-weak-s3", "control", 0.0): sites,
         ("r500-weak-s3", TURNED, 0.0): sites,
+        ("r500-weak-s3", OWN, 96.0): sites,
         ("r500-weak-s3", ABSENT, 96.0): sites,
         ("r500-weak-s3", "R1 built", 96.0): sites,
         ("r250-weak-s3", "R1 built", 96.0): sites,

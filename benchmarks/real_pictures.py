@@ -9,8 +9,10 @@ labels are the layers of the map, roads as one class. Intervals (95 %) draw view
 """
 
 import argparse
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -18,6 +20,7 @@ import numpy as np
 from sasgeo_baselines.segmenters.osm_unet import OsmUNet
 
 import sasgeo_bench as sgb
+from sasgeo_bench.core.config import JsonDocument
 from sasgeo_bench.scoring.segmentation import PixelCounts, segmentation_scores
 from sasgeo_bench.sensing.reference_imagery import region_views
 
@@ -56,14 +59,42 @@ def part_of(region: sgb.Region, box: Sequence[float]) -> tuple[float, float, flo
     return west + left * width, north - bottom * height, west + right * width, north - top * height
 
 
-def counted(segmenter: sgb.Segmenter, region: sgb.Region, box: Sequence[float]) -> Iterator[PixelCounts]:
-    """Yield the counts of each view of a part of a region's picture."""
+class Area(JsonDocument):
+    """Area under the ROC curve of a class, with the interval of draws of views; share of the pixels that it covers."""
+
+    auc: float
+    low: float | None  # None: of a single view
+    high: float | None
+    share: float
+
+
+def counted(
+    segmenter: sgb.Segmenter, region: sgb.Region, box: Sequence[float], *, most: int | None = None
+) -> Iterator[PixelCounts]:
+    """Yield the counts of each view of a part of a region's picture; of every second, third ... for at most `most`."""
     if region.imagery is None:
         raise SystemExit(f"{region.manifest.id} has no imagery: name a region whose file has [[imagery]]")
-    views = region_views(region, part_of(region, box), place=region.manifest.id, gsd_m=GSD_M, side_px=SIDE_PX)
-    for number, view in enumerate(views):
+    west, south, east, north = bounds_m = part_of(region, box)
+    side_m = GSD_M * SIDE_PX
+    squares = math.ceil((east - west) / side_m) * math.ceil((north - south) / side_m)
+    views = region_views(region, bounds_m, place=region.manifest.id, gsd_m=GSD_M, side_px=SIDE_PX)
+    for number, view in enumerate(islice(views, 0, None, math.ceil(squares / most) if most else None)):
         found = joined_answer(segmenter.segment(view.image, learned=None))
         yield PixelCounts.of(joined_labels(view), found, image=str(number))
+
+
+def areas_of(counts: Sequence[PixelCounts]) -> dict[str, Area]:
+    """Return the area under the curve of each class of `SHOWN` that the views show, in that order."""
+    scores = segmentation_scores(counts, draws=500, groups=["all"])
+    rows = scores[scores["metric"] == "auc"].set_index("class")
+    found = {}
+    for name in SHOWN:
+        if name in rows.index and np.isfinite(rows.loc[name, "value"]):
+            pixels = sum(one.of_class(name) for one in counts)
+            low, high = (None if np.isnan(end) else float(end) for end in rows.loc[name, ["lo_images", "hi_images"]])
+            share = float(pixels[1].sum() / pixels.sum())
+            found[name] = Area(auc=float(rows.loc[name, "value"]), low=low, high=high, share=share)
+    return found
 
 
 def main() -> None:
@@ -80,15 +111,9 @@ def main() -> None:
     print("| region | class | AUC | 95 % | share | views |\n|---|---|---:|---|---:|---:|")
     for name in options.regions:
         counts = list(counted(segmenter, sgb.read_region(options.out / "regions" / name), box))
-        scores = segmentation_scores(counts, draws=500, segmenter=segmenter.card.name)
-        rows = scores[(scores["group"] == "all") & (scores["metric"] == "auc")].set_index("class")
-        for shown in SHOWN:
-            if shown not in rows.index or not np.isfinite(rows.loc[shown, "value"]):
-                continue
-            row, pixels = rows.loc[shown], sum(one.of_class(shown) for one in counts)
-            share = pixels[1].sum() / pixels.sum()
-            limits = f"{row['lo_images']:.3f} to {row['hi_images']:.3f}"
-            print(f"| {name} | {shown} | {row['value']:.3f} | {limits} | {share:.3f} | {len(counts)} |")
+        for shown, area in areas_of(counts).items():
+            limits = "-" if area.low is None else f"{area.low:.3f} to {area.high:.3f}"
+            print(f"| {name} | {shown} | {area.auc:.3f} | {limits} | {area.share:.3f} | {len(counts)} |")
 
 
 if __name__ == "__main__":

@@ -64,7 +64,8 @@ class Part(NamedTuple):
         return cls(name, (west, east, north, south))
 
     def __str__(self) -> str:
-        return ":".join([self.region, *([] if self == type(self)(self.region) else [",".join(map(str, self.box))])])
+        numbers = ",".join(f"{at:g}" for at in self.box)
+        return self.region if self.box == Part(self.region).box else f"{self.region}:{numbers}"
 
 
 # Maps that are drawn: one place at least of each train country of the split `world`, but those under pictures.

@@ -28,6 +28,7 @@ from typing import Final
 
 import shapely
 from pydantic import ValidationError
+from sasgeo_baselines.segmenters.osm_unet import OsmUNet
 
 from benchmarks.real_pictures import Area, areas_of, counted, part_of
 from benchmarks.segmenter_lessons import DRAWN, HELD, PART, REAL, Part, Source, region_of, sources_of
@@ -153,7 +154,7 @@ def check_untaught(sources: Sequence[Source], places: Sequence[Part], out: Path)
 
 def carry_out(arm: str, plan: Plan) -> None:
     """Teach an arm, ask it, and keep what it sees."""
-    from benchmarks.train_segmenter import OsmUNet, Recipe, export, train  # noqa: PLC0415 - needs PyTorch
+    from benchmarks.train_segmenter import Recipe, export, train  # noqa: PLC0415 - needs PyTorch
 
     sources, state, weights = ARMS[arm].sources(plan.out), plan.path(arm, ".pt"), plan.path(arm, ".onnx")
     check_untaught(sources, plan.places, plan.out)
@@ -173,17 +174,7 @@ def carry_out(arm: str, plan: Plan) -> None:
 
 
 def table(results: Mapping[str, Result]) -> str:
-    """Return results as Markdown: the area under the curve by class, and how much the base has less of it.
-
-    >>> def seen(arm, auc):
-    ...     area = Area(auc=auc, low=None, high=None, share=0.1)
-    ...     return Result(arm=arm, steps=10, views=1, places={"hill": PlaceResult(views=1, areas={"green": area})})
-    >>> print(table({"drawn": seen("drawn", 0.8), "drawn-again": seen("drawn-again", 0.79)}))
-    | arm | place | n | building | road | water | green | farmland |
-    |---|---|---:|---:|---:|---:|---:|---:|
-    | drawn | hill | 1 | - | - | - | 0.800 | - |
-    | drawn-again | hill | 1 | - | - | - | 0.790 (-0.010) | - |
-    """
+    """Return results as Markdown: the area under the curve by class, and how much the base has less of it."""
     lines = [f"| arm | place | n | {' | '.join(SHOWN)} |", f"|---|---|{'---:|' * (1 + len(SHOWN))}"]
     for arm, result in results.items():
         base = results.get(ARMS[arm].base or "")

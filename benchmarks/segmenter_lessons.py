@@ -47,17 +47,14 @@ class Part(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read NAME or NAME:WEST,EAST,NORTH,SOUTH.
-
-        >>> Part.parse("pardubice-ortho:0,1,0.8,1")
-        Part(region='pardubice-ortho', box=(0.0, 1.0, 0.8, 1.0))
-        """
+        """Read NAME or NAME:WEST,EAST,NORTH,SOUTH."""
         name, colon, numbers = text.partition(":")
         try:
             west, east, north, south = map(float, numbers.split(",")) if colon else cls(name).box
+            is_box = 0 <= west < east <= 1 and 0 <= north < south <= 1
         except ValueError:
-            west = east = math.nan
-        if not (name and 0 <= west < east <= 1 and 0 <= north < south <= 1):
+            is_box = False
+        if not (name and is_box):
             raise argparse.ArgumentTypeError(
                 f"{text!r} is no part of a picture: give NAME or NAME:WEST,EAST,NORTH,SOUTH, fractions from 0 to 1"
             )

@@ -30,7 +30,8 @@ import shapely
 from pydantic import ValidationError
 from sasgeo_baselines.segmenters.osm_unet import OsmUNet
 
-from benchmarks.real_pictures import Area, areas_of, counted, part_of
+import sasgeo_bench as sgb
+from benchmarks.real_pictures import GSD_M, SIDE_PX, Area, areas_of, counted, part_of, views_of
 from benchmarks.segmenter_lessons import DRAWN, HELD, PART, REAL, Part, Source, region_of, sources_of
 from sasgeo_bench.core.config import JsonDocument
 from sasgeo_bench.core.errors import SasgeoError, StoreError
@@ -139,6 +140,13 @@ class Plan:
         return result
 
 
+def stride_of(region: sgb.Region, part: Part, most: int) -> int:
+    """Return which views to ask, so that a part has at most `most`: every second, every third ..."""
+    west, south, east, north = part_of(region, part.box)
+    side_m = GSD_M * SIDE_PX
+    return math.ceil(math.ceil((east - west) / side_m) * math.ceil((north - south) / side_m) / most)
+
+
 def check_untaught(sources: Sequence[Source], places: Sequence[Part], out: Path) -> None:
     """End with one line if a picture is asked that taught."""
     for part in places:
@@ -164,7 +172,8 @@ def carry_out(arm: str, plan: Plan) -> None:
     export(train(sources, state, Recipe(steps=plan.steps, part=min(PART, plan.steps), seed=ARMS[arm].seed)), weights)
     segmenter, places = OsmUNet(weights), {}
     for part in plan.places:
-        counts = list(counted(segmenter, region_of(part.region, plan.out), part.box, most=plan.views))
+        region = region_of(part.region, plan.out)
+        counts = list(counted(segmenter, views_of(region, part.box, stride_of(region, part, plan.views))))
         places[str(part)] = PlaceResult(views=len(counts), areas=areas_of(counts))
     result = Result(arm=arm, steps=plan.steps, views=plan.views, places=places)
     with fresh_file(plan.path(arm, ".json"), mend="check your rights and the free space") as scratch:

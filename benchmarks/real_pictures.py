@@ -5,11 +5,12 @@
 
 The regions are built in `--out` and have imagery. Their pictures are cut into views of 256 m, north up, without gaps;
 labels are the layers of the map, roads as one class. Intervals (95 %) draw views; they say nothing of other places.
-`--weights FILE` asks other weights of `osm_unet`, `--box W,E,N,S` a part of the picture, as fractions of its sides.
+`--weights FILE` asks other weights of `osm_unet`, `--box W,E,N,S` a part of the picture, as fractions of its sides,
+`--every N` every Nth view. `--adapt` adapts `osm_unet` without labels: `exposure` takes that of the whole picture
+instead of each view's, `mirrored` the mean with the mirrored view, `both` both.
 """
 
 import argparse
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from sasgeo_baselines.segmenters.osm_unet import OsmUNet
+from sasgeo_baselines.segmenters.osm_unet import WEIGHTS, Exposure, OsmUNet
 
 import sasgeo_bench as sgb
 from sasgeo_bench.core.config import JsonDocument
@@ -29,6 +30,7 @@ ROAD: Final = "road"
 SHOWN: Final = ("building", ROAD, "path_track", "railway", "water", "green", "farmland", "parking", "bare")
 GSD_M: Final = 0.5
 SIDE_PX: Final = 512
+THIN: Final = 4
 
 
 def joined_labels(view: sgb.LabelledImage) -> sgb.LabelledImage:
@@ -59,6 +61,27 @@ def part_of(region: sgb.Region, box: Sequence[float]) -> tuple[float, float, flo
     return west + left * width, north - bottom * height, west + right * width, north - top * height
 
 
+def views_of(region: sgb.Region, box: Sequence[float], every: int = 1) -> Iterator[sgb.LabelledImage]:
+    """Return every so manieth view of a part of a region's picture."""
+    if region.imagery is None:
+        raise SystemExit(f"{region.manifest.id} has no imagery: name a region whose file has [[imagery]]")
+    views = region_views(region, part_of(region, box), place=region.manifest.id, gsd_m=GSD_M, side_px=SIDE_PX)
+    return islice(views, 0, None, every)
+
+
+def exposure_of(views: Iterator[sgb.LabelledImage]) -> Exposure:
+    """Return the exposure of some views together: of a pixel in `THIN` along each axis, where there is a picture."""
+    pixels = [view.image.rgb[::THIN, ::THIN][view.image.rgb[::THIN, ::THIN].any(axis=2)] for view in views]
+    return Exposure.of(np.concatenate(pixels))
+
+
+def counted(segmenter: sgb.Segmenter, views: Iterator[sgb.LabelledImage]) -> Iterator[PixelCounts]:
+    """Yield the counts of each view."""
+    for number, view in enumerate(views):
+        found = joined_answer(segmenter.segment(view.image, learned=None))
+        yield PixelCounts.of(joined_labels(view), found, image=str(number))
+
+
 class Area(JsonDocument):
     """Area under the ROC curve of a class, with the interval of draws of views; share of the pixels that it covers."""
 
@@ -66,21 +89,6 @@ class Area(JsonDocument):
     low: float | None  # None: of a single view
     high: float | None
     share: float
-
-
-def counted(
-    segmenter: sgb.Segmenter, region: sgb.Region, box: Sequence[float], *, most: int | None = None
-) -> Iterator[PixelCounts]:
-    """Yield the counts of each view of a part of a region's picture; of every second, third ... for at most `most`."""
-    if region.imagery is None:
-        raise SystemExit(f"{region.manifest.id} has no imagery: name a region whose file has [[imagery]]")
-    west, south, east, north = bounds_m = part_of(region, box)
-    side_m = GSD_M * SIDE_PX
-    squares = math.ceil((east - west) / side_m) * math.ceil((north - south) / side_m)
-    views = region_views(region, bounds_m, place=region.manifest.id, gsd_m=GSD_M, side_px=SIDE_PX)
-    for number, view in enumerate(islice(views, 0, None, math.ceil(squares / most) if most else None)):
-        found = joined_answer(segmenter.segment(view.image, learned=None))
-        yield PixelCounts.of(joined_labels(view), found, image=str(number))
 
 
 def areas_of(counts: Sequence[PixelCounts]) -> dict[str, Area]:
@@ -105,12 +113,21 @@ def main() -> None:
     parser.add_argument("--segmenter", default="osm_unet", help="name of one that needs no training")
     parser.add_argument("--weights", type=Path, help="of osm_unet, instead of those that ship")
     parser.add_argument("--box", default="0,1,0,1", help="west, east, north, south")
+    parser.add_argument("--every", type=int, default=1, help="take one view of so many")
+    parser.add_argument("--adapt", choices=("exposure", "mirrored", "both"), help="of osm_unet")
     options = parser.parse_args()
-    segmenter = OsmUNet(options.weights) if options.weights else sgb.load_segmenter(options.segmenter)
     box = [float(part) for part in options.box.split(",")]
     print("| region | class | AUC | 95 % | share | views |\n|---|---|---:|---|---:|---:|")
     for name in options.regions:
-        counts = list(counted(segmenter, sgb.read_region(options.out / "regions" / name), box))
+        region = sgb.read_region(options.out / "regions" / name)
+        segmenter = sgb.load_segmenter(options.segmenter)
+        if options.weights or options.adapt:
+            segmenter = OsmUNet(
+                options.weights or WEIGHTS,
+                exposure=exposure_of(views_of(region, box)) if options.adapt in ("exposure", "both") else None,
+                is_mirrored=options.adapt in ("mirrored", "both"),
+            )
+        counts = list(counted(segmenter, views_of(region, box, options.every)))
         for shown, area in areas_of(counts).items():
             limits = "-" if area.low is None else f"{area.low:.3f} to {area.high:.3f}"
             print(f"| {name} | {shown} | {area.auc:.3f} | {limits} | {area.share:.3f} | {len(counts)} |")

@@ -25,7 +25,7 @@ from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
 from sasgeo_bench.tasks.build import is_of_region, look_of, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
-from sasgeo_bench.tasks.query import BY, CONTROLS, SEQUENCE, PriorGroup, base_of
+from sasgeo_bench.tasks.query import BY, CONTROLS, RENDERED, SEQUENCE, PriorGroup, base_of
 from sasgeo_bench.tasks.split import HALVES, Split
 from sasgeo_bench.tasks.suites.all_suites import find_suite, is_pictured, known_suite
 from sasgeo_bench.tasks.suites.base import Choice
@@ -127,10 +127,15 @@ def trains(split: Split, region: str) -> bool:
 def needed(requests: Sequence[Request], learning: LearningSpec | None) -> tuple[Request, ...]:
     """Return the requests that are learned from or asked: on train places of a hold-out only suites to learn from.
 
-    Raise `ConfigError` if learning from a hold-out has no train or no test place, or a region of several parts.
+    Those are the suites of `learning`, and rendered pictures, which segmenters learn from. Raise `ConfigError` if
+    learning from a hold-out has no train or no test place, or a region of several parts.
     """
-    taught = frozenset[str]() if learning is None else frozenset(learning.suites)
-    found = tuple(item for item in requests if not trains(item.split, item.region.id) or item.suite in taught)
+    taught = {name.partition(BY)[0] for name in (() if learning is None else learning.suites)}
+    found = tuple(
+        item
+        for item in requests
+        if not trains(item.split, item.region.id) or item.suite in taught or _is_rendered(item)
+    )
     split = requests[0].split
     if not is_holdout(split):
         return found
@@ -141,6 +146,11 @@ def needed(requests: Sequence[Request], learning: LearningSpec | None) -> tuple[
             f"no region is of a test place of the hold-out {split.spec.id!r}, and a board ranks these alone: add one"
         )
     return found
+
+
+def _is_rendered(request: Request) -> bool:
+    suite = request.found
+    return suite.is_pictured and RENDERED in suite.drawn_by(request.choice.detectors)
 
 
 def _check_parts(requests: Sequence[Request], split: Split) -> None:

@@ -5,7 +5,15 @@ import cv2
 import numpy as np
 import pytest
 from sasgeo_baselines.segmenters import osm_unet
-from sasgeo_baselines.segmenters.osm_unet import CLASSES, WEIGHTS, OsmUNet, normalized
+from sasgeo_baselines.segmenters.osm_unet import (
+    CLASSES,
+    HELD_OUT_WEIGHTS,
+    WEIGHTS,
+    Exposure,
+    OsmUNet,
+    OsmUNetHeldOut,
+    normalized,
+)
 
 import sasgeo_bench as sgb
 from sasgeo_bench.running.segmenter_testing import check_segmenter
@@ -36,15 +44,22 @@ def chances(image):
     return OsmUNet().segment(image, learned=None).probabilities()
 
 
-def test_the_weights_are_small_and_the_card_names_what_taught_them():
-    assert WEIGHTS.stat().st_size <= 3e6
-    assert OsmUNet.card.trained_on
-    assert OsmUNet.card.classes == CLASSES
+def test_the_weights_are_small_and_the_cards_name_what_taught_them():
+    assert max(path.stat().st_size for path in (WEIGHTS, HELD_OUT_WEIGHTS)) <= 3e6
+    assert OsmUNet.card.classes == OsmUNetHeldOut.card.classes == CLASSES
+    assert set(OsmUNet.card.trained_on) > set(OsmUNetHeldOut.card.trained_on)
 
 
-def test_the_kit_finds_no_fault():
-    faults = [check for check in check_segmenter("osm_unet") if check.outcome == "fail"]
+@pytest.mark.parametrize("name", ["osm_unet", "osm_unet_held_out"])
+def test_the_kit_finds_no_fault(name):
+    faults = [check for check in check_segmenter(name) if check.outcome == "fail"]
     assert not faults
+
+
+def test_what_was_kept_back_changes_what_is_seen():
+    image = ortho(patchwork(256), 0.5)
+    first, second = (kind().segment(image, learned=None).probabilities() for kind in (OsmUNet, OsmUNetHeldOut))
+    assert 0.01 < np.abs(first - second).mean() < 0.2
 
 
 def test_exposure_haze_and_holes_change_nothing_that_the_network_sees():
@@ -56,7 +71,7 @@ def test_exposure_haze_and_holes_change_nothing_that_the_network_sees():
     np.testing.assert_allclose(normalized(brighter), plain, atol=1e-4)
     holed = np.concatenate([rgb, np.zeros_like(rgb)])
     is_known = np.arange(len(holed)) < len(rgb)
-    seen = normalized(holed, np.repeat(is_known[:, None], rgb.shape[1], axis=1))
+    seen = normalized(holed, Exposure.of(holed[is_known].reshape(-1, 3)))
     np.testing.assert_allclose(seen[:, : len(rgb)], plain, atol=1e-4)
 
 
@@ -91,3 +106,24 @@ def test_holes_are_silent():
     found = chances(ortho(rgb, 0.5))
     assert np.isnan(found[:, :, :110]).all()
     assert np.isfinite(found[:, :, 130:]).all()
+
+
+def test_with_its_mirror_image_a_picture_gives_what_its_mirror_image_gives():
+    rgb = patchwork(256)
+    segmenter = OsmUNet(is_mirrored=True)
+    first, second = (
+        segmenter.segment(ortho(one, 0.5), learned=None).probabilities()
+        for one in (rgb, np.ascontiguousarray(rgb[:, ::-1]))
+    )
+    np.testing.assert_allclose(second[:, :, ::-1], first, atol=1.5 / 254)
+    assert np.abs(first - chances(ortho(rgb, 0.5))).max() > 0.02
+
+
+def test_exposure_is_that_of_the_picture_unless_another_is_given():
+    rgb = patchwork(256)
+    image = ortho(rgb, 0.5)
+    own = OsmUNet(exposure=Exposure.of(rgb.reshape(-1, 3))).segment(image, learned=None)
+    np.testing.assert_array_equal(own.probability_bytes, OsmUNet().segment(image, learned=None).probability_bytes)
+    brighter = Exposure.of(np.asarray(rgb // 2 + 120, dtype=np.uint8).reshape(-1, 3))
+    other = OsmUNet(exposure=brighter).segment(image, learned=None)
+    assert (other.probability_bytes != own.probability_bytes).any()

@@ -119,6 +119,33 @@ def test_without_learning_train_places_are_left_out_in_one_line(plan_of):
     assert lines == [f"nothing learns, so train places are left out: {TRAIN}"]
 
 
+PICTURES = """[[task]]
+suites = ["aerial"]
+sites = 1
+kinds = ["P1"]
+segmenters = ["pixel_forest"]
+detectors = ["DETECTOR"]
+
+"""
+
+
+@pytest.mark.parametrize(("detector", "is_drawn"), [("rendered", True), ("shifted", False)])
+def test_pictures_of_train_places_are_drawn_for_segmenters_to_learn_from(plan_of, detector, is_drawn):
+    pictures = PICTURES.replace("DETECTOR", detector)
+    text = TEXT[TEXT.index("[learning]") :]
+    found = requests_of(plan_of(**{text: pictures, '"learners:Counts", "learners:Oracle", ': ""}))
+    assert (("aerial", TRAIN) in found) == is_drawn
+    assert ("clean", TRAIN) not in found
+
+
+def test_a_matcher_learns_from_what_a_segmenter_saw_on_train_places(plan_of):
+    learning = '[learning]\nsuites = ["aerial+pixel_forest"]\ndetector = "shifted"\n'
+    pictures = PICTURES.replace("DETECTOR", "shifted")
+    found = requests_of(plan_of(**{'[learning]\nsuites = ["clean"]\n': pictures + learning}))
+    assert ("aerial", TRAIN) in found
+    assert ("clean", TRAIN) not in found
+
+
 def test_controls_are_drawn_where_nothing_trains(plan_of, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline_plan, "CONTROL_REGIONS", ("town-riverside", TRAIN))
     assert {item.region.id for item in plan_of().controls} == {"town-riverside"}

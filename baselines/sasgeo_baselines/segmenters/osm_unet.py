@@ -2,9 +2,10 @@
 """`osm_unet`: a small U-Net that ships with weights, taught with OpenStreetMap as labels; runs on OpenCV alone."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import cv2
 import numpy as np
@@ -15,7 +16,9 @@ import sasgeo_bench as sgb
 from sasgeo_baselines.segmenters.features import Plane, enlarged, enlarged_mask, ground_pixel_m, has_data
 from sasgeo_baselines.segmenters.network import card_with
 
-WEIGHTS: Final = Path(__file__).with_suffix(".onnx")  # written by benchmarks/train_segmenter.py
+# Written by benchmarks/train_segmenter.py: taught by every picture that may teach, and by those of train places alone.
+WEIGHTS: Final = Path(__file__).with_suffix(".onnx")
+HELD_OUT_WEIGHTS: Final = Path(__file__).with_name("osm_unet_held_out.onnx")
 CLASSES: Final = (
     *("building", "road_major", "road_minor", "path_track", "railway"),
     *("water", "green", "farmland", "parking", "bare"),
@@ -29,11 +32,26 @@ _MARGIN_PX: Final = 192  # around a tile: what an answer depends on lies nearer
 _LEAST_SPREAD: Final = 1.0  # of 0..255: a picture of one colour is not stretched to a pattern
 
 
-def normalized(rgb: NDArray[np.uint8], is_known: NDArray[np.bool_] | None = None) -> Plane:
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Means of the bands, shape (3, 1, 1), and the spread of all, of one picture or of many by the same camera."""
+
+    means: Plane
+    spread: float
+
+    @classmethod
+    def of(cls, pixels: NDArray[np.uint8]) -> Self:
+        """Measure pixels, shape (N, 3); raise `ValueError` if there is none."""
+        values = pixels.astype(np.float32)
+        means = values.mean(axis=0)
+        return cls(means.reshape(3, 1, 1), max(float(np.sqrt(((values - means) ** 2).mean())), _LEAST_SPREAD))
+
+
+def normalized(rgb: NDArray[np.uint8], exposure: Exposure | None = None) -> Plane:
     """Return what the network sees of a picture, shape (3, H, W): each band less its mean, by one spread for all.
 
-    Sun, haze and sensor move the bands of a picture together, so no camera needs a calibration. Pixels that are not
-    `is_known`, shape (H, W), count neither for means nor for the spread.
+    Sun, haze and sensor move the bands of a picture together, so no camera needs a calibration. Without `exposure`,
+    that of the picture is taken.
 
     Examples
     --------
@@ -41,11 +59,8 @@ def normalized(rgb: NDArray[np.uint8], is_known: NDArray[np.bool_] | None = None
     >>> seen[:, 0, 0].tolist(), seen[:, 0, 1].tolist()
     ([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0])
     """
-    bands = np.moveaxis(rgb, 2, 0).astype(np.float32)
-    some = bands.reshape(3, -1) if is_known is None or not is_known.any() else bands[:, is_known]
-    means = some.mean(axis=1, keepdims=True)
-    spread = max(float(np.sqrt(((some - means) ** 2).mean())), _LEAST_SPREAD)
-    return np.asarray((bands - means[:, :, None]) / spread, dtype=np.float32)
+    by = exposure or Exposure.of(rgb.reshape(-1, 3))
+    return np.asarray((np.moveaxis(rgb, 2, 0) - by.means) / np.float32(by.spread), dtype=np.float32)
 
 
 class OsmUNet:
@@ -67,11 +82,11 @@ class OsmUNet:
             "Pixels of 0.3 to 1 m, seen from above; parking, bare ground and fields are guessed more than seen; "
             "steep valleys, deserts and snow were not taught"
         ),
-        trained_on=("pardubice", "banepa"),
+        trained_on=("pardubice", "banepa", "chateaugiron", "koeln"),
     )
 
-    def __init__(self, weights: Path = WEIGHTS) -> None:
-        self._weights = weights
+    def __init__(self, weights: Path = WEIGHTS, *, exposure: Exposure | None = None, is_mirrored: bool = False) -> None:
+        self._weights, self._exposure, self._is_mirrored = weights, exposure, is_mirrored
         self.card = card_with(type(self).card, weights)
 
     def segment(self, image: sgb.AerialImage, *, learned: str | None) -> sgb.Segmentation:
@@ -79,10 +94,25 @@ class OsmUNet:
         del learned  # it learns nothing
         small, pixel_m = _working_picture(image)
         is_known = has_data(small, pixel_m)
-        odds = _log_odds(_network(self._weights), normalized(small, is_known))
+        exposure = self._exposure or Exposure.of(small[is_known] if is_known.any() else small.reshape(-1, 3))
+        odds = _log_odds(_network(self._weights), normalized(small, exposure), is_mirrored=self._is_mirrored)
         found = np.stack([enlarged(expit(plane), image.shape) for plane in odds])
         found[:, ~enlarged_mask(is_known, image.shape)] = np.nan
         return sgb.Segmentation.of_probabilities(CLASSES, found)
+
+
+class OsmUNetHeldOut(OsmUNet):
+    """The same network, taught in the same way without the pictures over Chateaugiron and Koeln, to be asked there."""
+
+    card = replace(
+        OsmUNet.card,
+        name="osm_unet_held_out",
+        title="osm_unet, taught without two of its four pictures",
+        trained_on=("pardubice", "banepa"),
+    )
+
+    def __init__(self, weights: Path = HELD_OUT_WEIGHTS) -> None:
+        super().__init__(weights)
 
 
 def _working_picture(image: sgb.AerialImage) -> tuple[NDArray[np.uint8], float]:
@@ -101,17 +131,25 @@ def _network(weights: Path) -> cv2.dnn.Net:
     return cv2.dnn.readNetFromONNX(str(weights))
 
 
-def _log_odds(network: cv2.dnn.Net, planes: Plane) -> Plane:
-    """Return the log-odds of each class in cells of `_STEP_PX` pixels a side, tile by tile."""
+def _log_odds(network: cv2.dnn.Net, planes: Plane, *, is_mirrored: bool) -> Plane:
+    """Return the log-odds of each class in cells of `_STEP_PX` pixels a side, or their mean with the mirror image's."""
     rows, cols = planes.shape[1:]
     padded = np.pad(planes, ((0, 0), (0, -rows % MULTIPLE), (0, -cols % MULTIPLE)), mode="symmetric")
-    height, width = (side // _STEP_PX for side in padded.shape[1:])
-    found = np.empty((len(CLASSES), height, width), dtype=np.float32)
-    for outer, inner, cut in _tiles(*padded.shape[1:]):
-        network.setInput(np.ascontiguousarray(padded[None, :, *outer]))
-        found[:, *inner] = network.forward()[0][:, *cut]
+    found = _by_tiles(network, padded)
+    if is_mirrored:
+        found += _by_tiles(network, padded[:, :, ::-1])[:, :, ::-1]
+        found /= 2
     # Cells of padding are cut, but for one that a picture of odd sides shares with it.
     return found[:, : -(-rows // _STEP_PX), : -(-cols // _STEP_PX)]
+
+
+def _by_tiles(network: cv2.dnn.Net, planes: Plane) -> Plane:
+    height, width = (side // _STEP_PX for side in planes.shape[1:])
+    found = np.empty((len(CLASSES), height, width), dtype=np.float32)
+    for outer, inner, cut in _tiles(*planes.shape[1:]):
+        network.setInput(np.ascontiguousarray(planes[None, :, *outer]))
+        found[:, *inner] = network.forward()[0][:, *cut]
+    return found
 
 
 Window = tuple[slice, slice]

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Say which pictures are found: by place, ground and size of the view, before and after, with perfect masks beside.
+
+    .venv/bin/python benchmarks/pictures.py docs/results/pictures
+    .venv/bin/python benchmarks/pictures.py docs/results/pictures --figure docs/figures/pictures.svg
+    .venv/bin/python benchmarks/pictures.py docs/results/pictures --chances out
+
+Reads `scores.parquet` of a board of `pipelines/pictures.toml`. Found is within 25 m and 5 deg; no answer is a miss.
+Intervals (95 %) are Wilson's of as many sites as there are, and say nothing of other places; those of all test places
+draw places. `--chances` scores the answers in `out` once more, real pictures of `osm_unet_held_out` alone, so that
+P(false fix) is fitted on Andorra's and read off at the test places.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.sim_to_real import estimate, line, read_scores
+from sasgeo_bench.boards.score import score_board
+from sasgeo_bench.boards.scored import ScoreRequest
+from sasgeo_bench.scoring.intervals import wilson_share
+from sasgeo_bench.tasks.split import find_split
+
+SEGMENTER: Final = "osm_unet_held_out"
+TOWN: Final = ("R1 built", "R1 mixed")
+SIDES_M: Final = (384.0, 256.0, 192.0, 128.0, 96.0)
+CALIBRATES: Final = "andorra-la-vella-ortho"
+REJECTOR: Final = "sasgeo_logistic"
+BINS: Final = (0.0, 0.05, 0.2, 0.5, 0.8, 1.0)  # of P(false fix)
+
+
+class Way(NamedTuple):
+    """A segmenter with a matcher that reads it."""
+
+    title: str
+    segmenter: str
+    matcher: str
+
+
+PERFECT: Final = Way("perfect masks", "oracle_segmenter", "sasgeo")
+BEFORE: Final = Way("before: states", "pixel_forest", "sasgeo_hard")
+AFTER: Final = Way("after", SEGMENTER, "sasgeo")
+WAYS: Final = (
+    BEFORE,
+    Way("before: raster_soft", "pixel_forest", "raster_soft"),
+    Way("osm_unet: states", SEGMENTER, "sasgeo_hard"),
+    Way("osm_unet: raster_soft", SEGMENTER, "raster_soft"),
+    AFTER,
+    PERFECT,
+)
+
+
+def of_way(scores: pd.DataFrame, way: Way) -> pd.DataFrame:
+    """Return the rows of a way."""
+    return scores[(scores["segmenter"] == way.segmenter) & (scores["matcher"] == way.matcher)]
+
+
+def percent(rows: pd.DataFrame) -> str:
+    """Return what is found of some rows, percent; a dash for none."""
+    return f"{100 * rows['hit'].mean():.0f}" if len(rows) else "-"
+
+
+def interval(rows: pd.DataFrame) -> str:
+    """Return Wilson's interval of what is found, of as many sites as the rows have, percent."""
+    found = wilson_share(float(rows["hit"].mean()), rows["pair_id"].nunique())
+    return f"{100 * found.lo:.0f} to {100 * found.hi:.0f}"
+
+
+def by_place(real: pd.DataFrame) -> Iterator[str]:
+    """Yield what is found of single views, by region, ground, size and disc."""
+    yield line("Region", "Ground", "View, m", "Disc, m", "n", *(way.title for way in WAYS), "after, 95 %")
+    yield line(*["---"] * 4, *["---:"] * (1 + len(WAYS)), "---")
+    views = real[real["kind"].str.startswith("R1")]
+    for region in dict.fromkeys(views["region"]):
+        for ground, kinds in (("built, mixed", TOWN), ("all", None)):
+            own = views[(views["region"] == region) & (views["kind"].isin(kinds) if kinds else True)]
+            for side_m in SIDES_M:
+                for radius_m in (250, 500):
+                    rows = own[(own["side_m"] == side_m) & (own["radius_m"] == radius_m)]
+                    after = of_way(rows, AFTER)
+                    if after.empty:
+                        continue
+                    found = [percent(of_way(rows, way)) for way in WAYS]
+                    yield line(region, ground, f"{side_m:g}", radius_m, len(after), *found, interval(after))
+
+
+def over_places(real: pd.DataFrame, regions: Sequence[str]) -> Iterator[str]:
+    """Yield what is found of the single views of some regions together, with intervals by places."""
+    yield line("View, m", "Disc, m", "n", "Places", *(f"{way.title} [95 %]" for way in WAYS))
+    yield line(*["---:"] * 4, *["---"] * len(WAYS))
+    views = real[real["kind"].str.startswith("R1") & real["region"].isin(regions)]
+    for side_m in SIDES_M:
+        for radius_m in (250, 500):
+            rows = views[(views["side_m"] == side_m) & (views["radius_m"] == radius_m)]
+            if rows.empty:
+                continue
+            after = of_way(rows, AFTER)
+            cells = []
+            for way in WAYS:
+                mine = of_way(rows, way)
+                value, lo, hi = estimate(mine, mine["hit"])
+                cells.append(f"{value:.0f} [{lo:.0f}, {hi:.0f}]")
+            yield line(f"{side_m:g}", radius_m, len(after), after["place"].nunique(), *cells)
+
+
+def by_step(real: pd.DataFrame) -> Iterator[str]:
+    """Yield what is found under the other steps: worse and older maps, several frames, the turned picture."""
+    yield line("Region", "Step", "View, m", "n", *(way.title for way in WAYS))
+    yield line(*["---"] * 3, *["---:"] * (1 + len(WAYS)))
+    steps = real[~real["kind"].str.startswith("R1")]
+    for (region, kind, strength, side_m), rows in steps.groupby(
+        ["region", "kind", "strength", "side_m"], observed=True, sort=True
+    ):
+        step = kind if kind == "control" else f"{kind} {strength:g}" if kind.startswith("R5") else kind
+        found = [percent(of_way(rows, way)) for way in WAYS]
+        yield line(region, step, f"{side_m:g}", len(of_way(rows, AFTER)), *found)
+
+
+def drawn(scores: pd.DataFrame) -> Iterator[str]:
+    """Yield what is found of drawn pictures, by look and size of the view, with intervals by places."""
+    ways = [way for way in WAYS if way.segmenter != PERFECT.segmenter]
+    yield line("Look", "View, m", "n", "Places", *(f"{way.title} [95 %]" for way in ways))
+    yield line("---", *["---:"] * 3, *["---"] * len(ways))
+    aerial = scores[(scores["suite"] == "aerial") & (scores["role"] != "falsifier")]
+    for (look, side_m), rows in aerial.groupby(["detector", "side_m"], observed=True, sort=True):
+        cells = []
+        for way in ways:
+            mine = of_way(rows, way)
+            value, lo, hi = estimate(mine, mine["hit"])
+            cells.append(f"{value:.0f} [{lo:.0f}, {hi:.0f}]")
+        after = of_way(rows, AFTER)
+        yield line(look, f"{side_m:g}", len(after), after["place"].nunique(), *cells)
+
+
+def judged(out: Path) -> pd.DataFrame:
+    """Return the answers of the way of today to real pictures at test places, with P(false fix) fitted on Andorra's."""
+    request = ScoreRequest(
+        predictions=[out / "runs"],
+        tasks=sorted((out / "tasks" / f"real-image+{SEGMENTER}").iterdir()),
+        root=out,
+        board=out / "boards" / "pictures-chances",
+        split=find_split("pictures"),
+        rejectors=(REJECTOR,),
+    )
+    return score_board(request).judged[AFTER.matcher, REJECTOR]
+
+
+def chances(answers: pd.DataFrame) -> Iterator[str]:
+    """Yield how often answers are false by stated chance, and what a threshold of 5 % keeps and lets through."""
+    some = answers[answers["is_answered"]]
+    p_false = 1 - some["p_right"]
+    yield line("P(false fix)", "n", "Stated, %", "False, %", "95 %")
+    yield line("---", *["---:"] * 3, "---")
+    for low, high in pairwise(BINS):
+        rows = some[(p_false >= low) & ((p_false < high) | (high == 1.0))]
+        if len(rows):
+            false = float((~rows["is_right"]).mean())
+            found = wilson_share(false, rows["pair_id"].nunique())
+            stated = 100 * float((1 - rows["p_right"]).mean())
+            limits = f"{100 * found.lo:.0f} to {100 * found.hi:.0f}"
+            yield line(f"{low:g} to {high:g}", len(rows), f"{stated:.0f}", f"{100 * false:.0f}", limits)
+    yield ""
+    yield line(
+        "Region", "n", "Right, %", "Half of the right kept: false among accepted, %", "Another town refused, %", "n"
+    )
+    yield line("---", *["---:"] * 5)
+    for region, rows in answers.groupby("region", observed=True):
+        present = rows[rows["is_present"] & (rows["role"] != "falsifier")]
+        absent = rows[~rows["is_present"]]
+        right = present.loc[present["is_right"], "p_right"].to_numpy(float)
+        least = float(np.median(right)) if len(right) else np.nan
+        taken = present[present["p_right"] >= least]
+        false = "-" if taken.empty else f"{100 * (~taken['is_right']).mean():.0f} of {len(taken)}"
+        refused = "-" if absent.empty else f"{100 * (~(absent['p_right'] >= least)).mean():.0f}"
+        yield line(region, len(present), f"{100 * present['is_right'].mean():.0f}", false, refused, len(absent))
+
+
+def draw(real: pd.DataFrame, path: Path) -> None:
+    """Draw what is found against the size of the view, before and after, a panel for each region."""
+    import matplotlib as mpl  # noqa: PLC0415 - slow to import, and wanted for the figure alone
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415
+
+    mpl.rcParams["svg.hashsalt"] = "pictures"
+    views = real[real["kind"].str.startswith("R1") & (real["radius_m"] == 250)]
+    regions = list(dict.fromkeys(views["region"]))
+    figure, panels = plt.subplots(1, len(regions), figsize=(2.2 * len(regions), 2.7), sharey=True, squeeze=False)
+    styles = ((PERFECT, "#999999", ":"), (AFTER, "#0072b2", "-"), (BEFORE, "#d55e00", "--"))
+    for panel, region in zip(panels[0], regions, strict=True):
+        for way, colour, style in styles:
+            rows = of_way(views[views["region"] == region], way)
+            means = rows.groupby("side_m")["hit"].mean()
+            panel.plot(means.index, 100 * means, style, color=colour, marker="o", markersize=3, label=way.title)
+        panel.set_title(
+            f"{region.removesuffix('-ortho')}\nn = {rows.groupby('side_m').size().min()} a point", fontsize=8
+        )
+        panel.set_xscale("log")
+        panel.set_xticks(SIDES_M, [f"{side_m:g}" for side_m in SIDES_M], fontsize=7)
+        panel.minorticks_off()
+        panel.set_ylim(-3, 103)
+        panel.grid(alpha=0.3)
+    panels[0][0].set_ylabel("found, %")
+    figure.supxlabel("side of the view, m", fontsize=9)
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="upper center", ncols=3, fontsize=8, frameon=False)
+    figure.tight_layout(rect=(0, 0, 1, 0.92))
+    figure.savefig(path, metadata={"Date": None})
+
+
+def main() -> None:
+    """Print the tables, or draw the figure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("board", type=Path)
+    parser.add_argument("--figure", type=Path, help="draw it instead of printing")
+    parser.add_argument("--chances", type=Path, help="folder of the run, to print P(false fix) instead")
+    given = parser.parse_args()
+    if given.chances is not None:
+        print("\n".join(chances(judged(given.chances))))
+        return
+    scores = read_scores(given.board, 25.0, 5.0)
+    radius_m = scores["prior_group"].astype(str).str.extract(r"r(\d+)", expand=False).astype(float)
+    scores = scores.assign(side_m=scores["view_cells"] * scores["cell_size_m"], radius_m=radius_m)
+    real = scores[(scores["suite"] == "real-image")]
+    if given.figure is not None:
+        draw(real, given.figure)
+        return
+    tests = [name for name in dict.fromkeys(real["region"]) if name != CALIBRATES]
+    for table in (by_place(real), over_places(real, tests), by_step(real), drawn(scores)):
+        print("\n".join(table), end="\n\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -21,6 +21,7 @@ import numpy as np
 from sasgeo_baselines.segmenters.osm_unet import WEIGHTS, Exposure, OsmUNet
 
 import sasgeo_bench as sgb
+from sasgeo_bench.core.config import JsonDocument
 from sasgeo_bench.scoring.segmentation import PixelCounts, segmentation_scores
 from sasgeo_bench.sensing.reference_imagery import region_views
 
@@ -81,6 +82,29 @@ def counted(segmenter: sgb.Segmenter, views: Iterator[sgb.LabelledImage]) -> Ite
         yield PixelCounts.of(joined_labels(view), found, image=str(number))
 
 
+class Area(JsonDocument):
+    """Area under the ROC curve of a class, with the interval of draws of views; share of the pixels that it covers."""
+
+    auc: float
+    low: float | None  # None: of a single view
+    high: float | None
+    share: float
+
+
+def areas_of(counts: Sequence[PixelCounts]) -> dict[str, Area]:
+    """Return the area under the curve of each class of `SHOWN` that the views show, in that order."""
+    scores = segmentation_scores(counts, draws=500, groups=["all"])
+    rows = scores[scores["metric"] == "auc"].set_index("class")
+    found = {}
+    for name in SHOWN:
+        if name in rows.index and np.isfinite(rows.loc[name, "value"]):
+            pixels = sum(one.of_class(name) for one in counts)
+            low, high = (None if np.isnan(end) else float(end) for end in rows.loc[name, ["lo_images", "hi_images"]])
+            share = float(pixels[1].sum() / pixels.sum())
+            found[name] = Area(auc=float(rows.loc[name, "value"]), low=low, high=high, share=share)
+    return found
+
+
 def main() -> None:
     """Print a row for each region and class."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -104,15 +128,9 @@ def main() -> None:
                 is_mirrored=options.adapt in ("mirrored", "both"),
             )
         counts = list(counted(segmenter, views_of(region, box, options.every)))
-        scores = segmentation_scores(counts, draws=500, segmenter=segmenter.card.name)
-        rows = scores[(scores["group"] == "all") & (scores["metric"] == "auc")].set_index("class")
-        for shown in SHOWN:
-            if shown not in rows.index or not np.isfinite(rows.loc[shown, "value"]):
-                continue
-            row, pixels = rows.loc[shown], sum(one.of_class(shown) for one in counts)
-            share = pixels[1].sum() / pixels.sum()
-            limits = f"{row['lo_images']:.3f} to {row['hi_images']:.3f}"
-            print(f"| {name} | {shown} | {row['value']:.3f} | {limits} | {share:.3f} | {len(counts)} |")
+        for shown, area in areas_of(counts).items():
+            limits = "-" if area.low is None else f"{area.low:.3f} to {area.high:.3f}"
+            print(f"| {name} | {shown} | {area.auc:.3f} | {limits} | {area.share:.3f} | {len(counts)} |")
 
 
 if __name__ == "__main__":

@@ -2,12 +2,14 @@
 """Teach the network of `osm_unet` on drawn and real crops, and write the weights that ship; needs PyTorch and onnx.
 
     .venv/bin/pip install torch onnx
-    .venv/bin/python benchmarks/train_segmenter.py --out out --name shipped --steps 4000
+    .venv/bin/python benchmarks/train_segmenter.py --out out --name osm_unet_held_out
+    .venv/bin/python benchmarks/train_segmenter.py --out out --name osm_unet \
+      --real pardubice-ortho:0,1,0,0.8 banepa chateaugiron-ortho koeln-ortho
 
 `--out` holds built regions. Crops are drawn from the maps of `--drawn` and cut out of the pictures over `--real`, as
 `sasgeo_bench.sensing.crops` yields them. The state is kept in `--out`/segmenters/osm_unet every few
 minutes, and the same command goes on from there. The same command gives the same weights on one machine and thread; a
-run that was cut off, too. At the end NAME.onnx lies beside the state; `--ship` puts it where the plugin reads it.
+run that was cut off, too. At the end NAME.onnx lies beside the state; `--ship` puts it where the plugins read theirs.
 """
 
 import argparse
@@ -204,7 +206,7 @@ def main() -> None:
     """Teach, write, and put the weights in place if that is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out"))
-    parser.add_argument("--name", default="osm_unet", help="of the state and the weights")
+    parser.add_argument("--name", default="osm_unet_held_out", help="of the state and the weights")
     parser.add_argument("--drawn", nargs="*", default=DRAWN, help="regions whose maps are drawn")
     parser.add_argument(
         "--real",
@@ -213,7 +215,7 @@ def main() -> None:
         default=REAL,
         help="regions with pictures: NAME, or NAME:WEST,EAST,NORTH,SOUTH",
     )
-    parser.add_argument("--drawn-share", type=float, default=0.5, help="of all crops")
+    parser.add_argument("--drawn-share", type=float, default=0.3, help="of all crops")
     parser.add_argument(
         "--calibrate",
         type=lambda text: Part.parse(text) if text else None,
@@ -224,7 +226,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=Recipe.batch, help="crops of a step")
     parser.add_argument("--rate", type=float, default=Recipe.rate, help="of learning, at its highest")
     parser.add_argument("--begin", type=Path, help="a kept state (*.pt) whose weights it begins with, else drawn ones")
-    parser.add_argument("--ship", action="store_true", help="copy the weights to where the plugin reads them")
+    parser.add_argument("--ship", action="store_true", help="copy the weights to where the plugins read theirs")
     options = parser.parse_args()
     folder = options.out / "segmenters" / "osm_unet"
     folder.mkdir(parents=True, exist_ok=True)
@@ -238,7 +240,7 @@ def main() -> None:
         export(net, weights)
     print(f"{weights}: {weights.stat().st_size / 1e6:.2f} MB")
     if options.ship:
-        shutil.copyfile(weights, WEIGHTS)
+        shutil.copyfile(weights, WEIGHTS.with_name(weights.name))
 
 
 if __name__ == "__main__":

@@ -57,6 +57,7 @@ PICTURE_SUITES: Final[dict[str, Suite]] = {
         pictures.SEASON_IMAGE,
         pictures.ACCUMULATED,
         corrupted.CORRUPTED,
+        pictures.OVERLAP_SCALE_TILT,
         real_image.REAL_IMAGE,
         corrupted.CORRUPTED_REAL,
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suites whose queries are rendered pictures: aerial, accumulated, light, oblique, relief and season-image."""
+"""Suites of rendered pictures: aerial, accumulated, light, oblique, overlap-scale-tilt, relief and season-image."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,6 +8,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
@@ -23,7 +24,7 @@ from sasgeo_bench.sensing.rendering.view import labels, render
 from sasgeo_bench.tasks.frame_evidence import poses_before
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import PAINTED, PERCEIVED, Detector
-from sasgeo_bench.tasks.suites.base import MAIN_VIEW_CELLS, QueryDraft, Suite, SuiteCard, Variant, ViewRequest
+from sasgeo_bench.tasks.suites.base import MAIN_VIEW_CELLS, QueryDraft, Scene, Suite, SuiteCard, Variant, ViewRequest
 
 if TYPE_CHECKING:
     from sasgeo_bench.sensing.rendering.palettes import Family
@@ -61,6 +62,9 @@ class Flight:
         Of the way between the frames.
     relief : float
         Multiplies the heights of buildings.
+    overlap : float
+        Share of the view, 0 to 1, that shows ground of the map. Beside it the picture shows its own other side the
+        wrong way round: ground such as there is, but nowhere on the map.
     conditions : callable
         Changes the ordinary conditions of the site.
     """
@@ -71,6 +75,7 @@ class Flight:
     stops_m: Sequence[tuple[float, float]] = ((0.0, 0.0),)
     odometry: Errors = ODOMETRY
     relief: float = 1.0
+    overlap: float = 1.0
     conditions: Callable[[Conditions], Conditions] = field(default=lambda ordinary: ordinary)
 
 
@@ -110,16 +115,20 @@ class PictureSuite(Suite):
 
         A model of perception takes none: it is what the same view would be worth without camera and segmenter.
         """
-        if shot.variant.detector in PERCEIVED:
-            return QueryDraft(evidence=shot.perceived())
         variant, flight = shot.variant, self.flight(shot.variant)
+        if variant.detector in PERCEIVED:
+            clean = shot.clean()
+            return QueryDraft(evidence=shot.perceived(clean.replace(_overlapping(shot, flight, clean.cells, axis=2))))
         of_weather = (shot.flight_seeds or shot.seeds).rng("conditions")
         conditions = flight.conditions(draw_conditions(of_weather, season="summer"))
         painted = _painted(shot, flight)
         beliefs = camera_beliefs(shot, flight)
         rng = shot.rng("sensor", variant.name)
-        pictures = [self.change(shot, render(painted, belief.true, conditions, rng)) for belief in beliefs]
-        found = [labels(painted, belief.true, season=conditions.season) for belief in beliefs]
+        wider = flight.height_m * LENS.width_px / LENS.focal_px[0] / variant.side_m
+        taken = [render(painted, belief.true, conditions, rng) for belief in beliefs]
+        pictures = [self.change(shot, _overlapping(shot, flight, rgb, axis=1, wider=wider)) for rgb in taken]
+        mapped = [labels(painted, belief.true, season=conditions.season) for belief in beliefs]
+        found = [_overlapping(shot, flight, planes, axis=2, wider=wider) for planes in mapped]
         state = shot.scene.world
         is_there = "building" in state.classes
         share = float((found[-1][state.classes.index("building")] == 1).mean()) if is_there else 0.0
@@ -147,6 +156,19 @@ class PictureSuite(Suite):
                 "building_share": round(share, 4),
             },
         )
+
+
+def _overlapping(
+    shot: ViewRequest, flight: Flight, seen: NDArray[np.uint8], *, axis: int, wider: float = 1.0
+) -> NDArray[np.uint8]:
+    """Return what is seen, mirrored along an axis beyond a share of the view; `wider` is its width in views."""
+    if flight.overlap == 1.0:
+        return seen
+    share = (np.arange(seen.shape[axis]) + 0.5) / seen.shape[axis]
+    is_own = share < 0.5 + (flight.overlap - 0.5) / wider
+    if shot.seeds.rng("overlap").random() < 0.5:  # the left side is lost instead
+        is_own = is_own[::-1]
+    return np.where(np.expand_dims(is_own, [at for at in range(seen.ndim) if at != axis]), seen, np.flip(seen, axis))
 
 
 @cache
@@ -376,6 +398,57 @@ OBLIQUE: Final = PictureSuite(
         Variant(role="falsifier", kind="no tilt"),
     ),
     flight=_oblique_flight,
+)
+
+
+OVERLAPS: Final = (1.0, 0.7, 0.4)
+SCALES: Final = (1.0, 1.5, 2.0)
+GRID_TILTS_DEG: Final = (0.0, 20.0, 40.0)
+# Flights by kind, all at scale 1
+_GRID: Final = {
+    f"P8 tilt {tilt_deg:g}, overlap {overlap:g}": Flight(tilt_deg=tilt_deg, overlap=overlap)
+    for tilt_deg in GRID_TILTS_DEG
+    for overlap in OVERLAPS
+}
+
+
+def _grid_flight(variant: Variant) -> Flight:
+    plain = _GRID.get(variant.kind, Flight())
+    return replace(plain, height_m=HEIGHT_M * (variant.strength or 1.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridSuite(PictureSuite):
+    """A suite whose pictures show more ground than the view: all of it is mapped, unless the camera is tilted."""
+
+    def clear_m(self, scene: Scene) -> float:
+        """Return half the side of the square that must be mapped: what the highest camera sees, in any heading."""
+        widest_m = max(SCALES) * HEIGHT_M * LENS.width_px / LENS.focal_px[0]
+        return max(super().clear_m(scene), widest_m / math.sqrt(2))
+
+
+OVERLAP_SCALE_TILT: Final = GridSuite(
+    card=SuiteCard(
+        name="overlap-scale-tilt",
+        version=1,
+        title="Overlap, scale and tilt (P8)",
+        what="All of the view, 70 or 40 % of it is ground of the map; the picture is taken from 160, 240 or 320 m, as "
+        "is known; and the camera tilts by 0, 20 or 40 deg ahead: each with each.",
+        separates="Matchers by what they bear of each, alone and together; those that compare pictures above all.",
+        falsifier="Another picture of full overlap from the control's height without tilt: scores as in the control.",
+        strength_unit="times the control's height",
+    ),
+    variants=(
+        Variant(role="control", kind="control"),
+        *(  # by height, and tilted behind all others: what is painted once serves those beside each other
+            Variant(role="stress", kind=kind, strength=scale)
+            for scale in SCALES
+            for kind, flight in _GRID.items()
+            if (scale, flight.tilt_deg, flight.overlap) != (1.0, 0.0, 1.0)
+        ),
+        Variant(role="falsifier", kind="control again"),
+    ),
+    flight=_grid_flight,
 )
 
 

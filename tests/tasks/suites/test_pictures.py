@@ -2,6 +2,7 @@
 """Suites of pictures: flights are those of their cards, and a drawn query shows the place that its truth names."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -57,11 +58,12 @@ def test_every_suite_has_a_control_a_ladder_and_a_falsifier_that_flies_as_the_co
     one, other = suite.flight(control), suite.flight(falsifier)
     ordinary = Conditions()
     assert one.conditions(ordinary) == other.conditions(ordinary)
-    assert (one.height_m, one.tilt_deg, one.is_fixed, one.relief) == (
+    assert (one.height_m, one.tilt_deg, one.is_fixed, one.relief, one.overlap) == (
         other.height_m,
         other.tilt_deg,
         other.is_fixed,
         other.relief,
+        other.overlap,
     )
     assert set(other.stops_m) == set(one.stops_m)
     flights = [suite.flight(item) for item in suite.variants if item.role == "stress"]
@@ -71,6 +73,7 @@ def test_every_suite_has_a_control_a_ladder_and_a_falsifier_that_flies_as_the_co
             item.tilt_deg,
             item.is_fixed,
             item.relief,
+            item.overlap,
             item.stops_m,
             item.odometry,
             item.conditions(ordinary),
@@ -78,6 +81,62 @@ def test_every_suite_has_a_control_a_ladder_and_a_falsifier_that_flies_as_the_co
         for item in flights
     }
     assert len(values) == len(flights)
+
+
+def test_overlap_scale_and_tilt_are_asked_each_with_each_and_the_control_has_none_of_them():
+    suite = pictures.OVERLAP_SCALE_TILT
+    flights = {item: suite.flight(item) for item in suite.variants}
+    asked = [
+        (flight.overlap, flight.height_m / 160, flight.tilt_deg)
+        for item, flight in flights.items()
+        if item.role != "falsifier"
+    ]
+    assert sorted(asked) == sorted(product((1.0, 0.7, 0.4), (1.0, 1.5, 2.0), (0.0, 20.0, 40.0)))
+    (control,) = (flight for item, flight in flights.items() if item.role == "control")
+    assert (control.overlap, control.height_m, control.tilt_deg) == (1.0, 160.0, 0.0)
+    assert {item.strength for item in flights if item.role == "stress"} == {1.0, 1.5, 2.0}
+
+
+@pytest.mark.parametrize("share", [0.7, 0.4])
+@pytest.mark.parametrize("height_m", [40.0, 80.0])
+def test_beside_its_overlap_a_view_shows_nothing_that_the_map_has_there(place, share, height_m):
+    whole, part = (suite_of(height_m=height_m, overlap=overlap) for overlap in (1.0, share))
+    lost_sides = set()
+    for seed in range(6):
+        shot = replace(shot_of(place), seeds=Seeds(root=seed, names=("here",)))
+        control, draft = whole.draw(shot), part.draw(shot)
+        one, other = (item.labels[0].labels for item in (control, draft))
+        cols = one.shape[2]
+        across_m = (np.arange(cols) + 0.5) / cols * height_m * 1.25 - height_m * 0.625  # of the optical axis
+        same = (one == other).all(axis=(0, 1))
+        edge_m = (share - 0.5) * 48
+        kept_left, kept_right = across_m < edge_m - 0.1, across_m > 0.1 - edge_m
+        is_left = bool(same[kept_left].all())
+        assert is_left or same[kept_right].all()
+        lost_sides.add(is_left)
+        lost = ~kept_left & (across_m > edge_m + 0.1) if is_left else ~kept_right & (across_m < -edge_m - 0.1)
+        np.testing.assert_array_equal(other[:, :, lost], one[:, :, ::-1][:, :, lost])
+        taken, shown = (item.frames[0].image().rgb.astype(float) for item in (control, draft))
+        wanted = np.where(lost[None, :, None], taken[:, ::-1], taken)
+        assert np.abs(shown - wanted)[:, np.abs(np.abs(across_m) - abs(edge_m)) > 1].mean() < 4  # WebP
+        assert control.frames[0].camera == draft.frames[0].camera
+    assert lost_sides == {True, False}
+
+
+def test_a_model_of_perception_sees_no_more_of_the_map_than_the_overlap(place):
+    suite, shot = suite_of(overlap=0.4), shot_of(place, replace(SMALL, detector="published"))
+    mirrored = shot.clean().cells.copy()
+    lost = slice(round(0.4 * 48), None)
+    mirrored[:, :, lost] = mirrored[:, :, ::-1][:, :, lost]
+    turned = shot.clean().cells.copy()
+    turned[:, :, : 48 - round(0.4 * 48)] = turned[:, :, ::-1][:, :, : 48 - round(0.4 * 48)]
+    expected = [shot.perceived(shot.clean().replace(cells)).cells for cells in (mirrored, turned)]
+    assert any((suite.draw(shot).evidence.cells == cells).all() for cells in expected)
+
+
+def test_the_highest_camera_of_the_grid_looks_at_mapped_ground_alone(place):
+    wide = pictures.OVERLAP_SCALE_TILT.clear_m(place[0])
+    assert wide == pytest.approx(np.hypot(200.0, 200.0), rel=0.01)
 
 
 def test_the_sun_sinks_and_the_air_thickens_along_the_ladder():

@@ -3,33 +3,38 @@
 
     .venv/bin/python benchmarks/pictures.py docs/results/pictures
     .venv/bin/python benchmarks/pictures.py docs/results/pictures --figure docs/figures/pictures.svg
-    .venv/bin/python benchmarks/pictures.py docs/results/pictures --chances out
+    .venv/bin/python benchmarks/pictures.py docs/results/pictures --chances
 
 Reads `scores.parquet` of a board of `pipelines/pictures.toml`. Found is within 25 m and 5 deg; no answer is a miss.
 Intervals (95 %) are Wilson's of as many sites as there are, and say nothing of other places; those of all test places
-draw places. `--chances` scores the answers in `out` once more, real pictures of `osm_unet_held_out` alone, so that
+draw places. `--chances` scores the stored answers once more, to real pictures of `osm_unet_held_out` alone, so that
 P(false fix) is fitted on Andorra's and read off at the test places.
 """
 
 import argparse
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from benchmarks.sim_to_real import estimate, line, read_scores
+from sasgeo_bench.boards.archive import request_of
 from sasgeo_bench.boards.score import score_board
-from sasgeo_bench.boards.scored import ScoreRequest
 from sasgeo_bench.scoring.intervals import wilson_share
+from sasgeo_bench.scoring.rejection import judge, rules_of
 from sasgeo_bench.tasks.split import find_split
 
+SPLIT: Final = "pictures"
 SEGMENTER: Final = "osm_unet_held_out"
 TOWN: Final = ("R1 built", "R1 mixed")
 SIDES_M: Final = (384.0, 256.0, 192.0, 128.0, 96.0)
 CALIBRATES: Final = "andorra-la-vella-ortho"
+AGAIN: Final = "koeln-ortho-osm"  # the views of koeln-ortho on a map without buildings
 REJECTOR: Final = "sasgeo_logistic"
 BINS: Final = (0.0, 0.05, 0.2, 0.5, 0.8, 1.0)  # of P(false fix)
 
@@ -137,17 +142,15 @@ def drawn(scores: pd.DataFrame) -> Iterator[str]:
         yield line(look, f"{side_m:g}", len(after), after["place"].nunique(), *cells)
 
 
-def judged(out: Path) -> pd.DataFrame:
+def judged(board: Path) -> pd.DataFrame:
     """Return the answers of the way of today to real pictures at test places, with P(false fix) fitted on Andorra's."""
-    request = ScoreRequest(
-        predictions=[out / "runs"],
-        tasks=sorted((out / "tasks" / f"real-image+{SEGMENTER}").iterdir()),
-        root=out,
-        board=out / "boards" / "pictures-chances",
-        split=find_split("pictures"),
-        rejectors=(REJECTOR,),
-    )
-    return score_board(request).judged[AFTER.matcher, REJECTOR]
+    rule = rules_of((REJECTOR,), find_split(SPLIT))[REJECTOR]
+    with TemporaryDirectory() as scratch:
+        request = request_of([board], board=Path(scratch) / "board", root=Path(scratch), split=SPLIT)
+        scored = score_board(replace(request, rejectors=()))
+    rows = scored.with_calibration[AFTER.matcher]
+    real = rows[(rows["suite"] == f"real-image+{SEGMENTER}") & (rows["role"] != "falsifier")].reset_index(drop=True)
+    return judge(real, scored.predictions[AFTER.matcher], rule.make, rule.split)
 
 
 def chances(answers: pd.DataFrame) -> Iterator[str]:
@@ -217,10 +220,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("board", type=Path)
     parser.add_argument("--figure", type=Path, help="draw it instead of printing")
-    parser.add_argument("--chances", type=Path, help="folder of the run, to print P(false fix) instead")
+    parser.add_argument("--chances", action="store_true", help="print P(false fix) instead")
     given = parser.parse_args()
-    if given.chances is not None:
-        print("\n".join(chances(judged(given.chances))))
+    if given.chances:
+        print("\n".join(chances(judged(given.board))))
         return
     scores = read_scores(given.board, 25.0, 5.0)
     radius_m = scores["prior_group"].astype(str).str.extract(r"r(\d+)", expand=False).astype(float)
@@ -229,7 +232,7 @@ def main() -> None:
     if given.figure is not None:
         draw(real, given.figure)
         return
-    tests = [name for name in dict.fromkeys(real["region"]) if name != CALIBRATES]
+    tests = [name for name in dict.fromkeys(real["region"]) if name not in (CALIBRATES, AGAIN)]
     for table in (by_place(real), over_places(real, tests), by_step(real), drawn(scores)):
         print("\n".join(table), end="\n\n")
 

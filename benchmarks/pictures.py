@@ -215,6 +215,23 @@ def draw(real: pd.DataFrame, path: Path) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
+def read_board(board: Path) -> pd.DataFrame:
+    """Return the rows of present places with `hit`, the segmenter, and the sides of the view and of the disc."""
+    scores = read_scores(board, 25.0, 5.0)
+    radius_m = scores["prior_group"].astype(str).str.extract(r"r(\d+)", expand=False).astype(float)
+    return scores.assign(side_m=scores["view_cells"] * scores["cell_size_m"], radius_m=radius_m)
+
+
+def tables(scores: pd.DataFrame) -> Iterator[Iterator[str]]:
+    """Yield the lines of each table, of the rows of `read_board`."""
+    real = scores[scores["suite"] == "real-image"]
+    tests = [name for name in dict.fromkeys(real["region"]) if name not in (CALIBRATES, AGAIN)]
+    yield by_place(real)
+    yield over_places(real, tests)
+    yield by_step(real)
+    yield drawn(scores)
+
+
 def main() -> None:
     """Print the tables, or draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -225,15 +242,11 @@ def main() -> None:
     if given.chances:
         print("\n".join(chances(judged(given.board))))
         return
-    scores = read_scores(given.board, 25.0, 5.0)
-    radius_m = scores["prior_group"].astype(str).str.extract(r"r(\d+)", expand=False).astype(float)
-    scores = scores.assign(side_m=scores["view_cells"] * scores["cell_size_m"], radius_m=radius_m)
-    real = scores[(scores["suite"] == "real-image")]
+    scores = read_board(given.board)
     if given.figure is not None:
-        draw(real, given.figure)
+        draw(scores[scores["suite"] == "real-image"], given.figure)
         return
-    tests = [name for name in dict.fromkeys(real["region"]) if name not in (CALIBRATES, AGAIN)]
-    for table in (by_place(real), over_places(real, tests), by_step(real), drawn(scores)):
+    for table in tables(scores):
         print("\n".join(table), end="\n\n")
 
 

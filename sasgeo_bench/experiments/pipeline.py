@@ -213,7 +213,11 @@ def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path]) -> list[Path]:
     asked: dict[str, list[Path]] = {}
     for spec in plan.spec.task:
         for segmenter in spec.segmenters:
-            asked.setdefault(segmenter, []).extend(task for task in pictured if task.parent.name in spec.suites)
+            asked.setdefault(segmenter, []).extend(
+                task
+                for task in pictured
+                if task.parent.name in spec.suites and (not spec.regions or base_of(task.name) in spec.regions)
+            )
     for segmenter, own in asked.items():
         wanted = SegmentTasks(
             spec=segmenter.removesuffix(RECALIBRATED),

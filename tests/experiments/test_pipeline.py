@@ -696,6 +696,26 @@ PICTURED = {
 }
 
 
+@pytest.mark.parametrize(
+    ("regions", "seen"),
+    [([], {"town-suburb", "town-grid", "town-grid+x"}), (["town-grid"], {"town-grid", "town-grid+x"})],
+)
+def test_segmenters_see_the_pictures_of_the_regions_of_their_task_and_learn_from_all(
+    tmp_path, monkeypatch, regions, seen
+):
+    plan = plan_pipeline(small(**PICTURED), out=tmp_path)
+    (task,) = plan.spec.task
+    chosen = task.model_copy(update={"regions": regions})
+    plan = replace(plan, spec=plan.spec.model_copy(update={"task": [chosen]}))
+    wanted = []
+    monkeypatch.setattr(pipeline, "segment_tasks", lambda request: wanted.append(request) or ())
+    drawn = [tmp_path / "tasks" / "aerial" / name for name in ("town-suburb", "town-grid", "town-grid+x")]
+    assert pipeline._with_evidence(plan, drawn) == []
+    (request,) = wanted
+    assert {folder.name for folder in request.tasks} == seen
+    assert set(request.taught) == set(drawn)
+
+
 def test_reference_imagery_shows_the_map_nearest_in_age_of_each_place(tmp_path, monkeypatch):
     plan = plan_pipeline(small(**PICTURED), out=tmp_path)
     assert "  reference imagery: 1 region, rendered (snow, family calibration, seed 0, 10 years older)" in (

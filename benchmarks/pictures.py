@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Say which pictures are found: by place, ground and size of the view, before and after, with perfect masks beside.
 
-    .venv/bin/python benchmarks/pictures.py docs/results/pictures
-    .venv/bin/python benchmarks/pictures.py docs/results/pictures --figure docs/figures/pictures.svg
-    .venv/bin/python benchmarks/pictures.py docs/results/pictures --chances
+    .venv/bin/python benchmarks/pictures.py out/boards/pictures
+    .venv/bin/python benchmarks/pictures.py out/boards/pictures --figure out/pictures.svg
+    .venv/bin/python benchmarks/pictures.py out/boards/pictures --chances out
 
 Reads `scores.parquet` of a board of `pipelines/pictures.toml`. Found is within 25 m and 5 deg; no answer is a miss.
 Intervals (95 %) are Wilson's of as many sites as there are, and say nothing of other places; those of all test places
-draw places. `--chances` scores the stored answers once more, to real pictures of `osm_unet_held_out` alone, so that
-P(false fix) is fitted on Andorra's and read off at the test places.
+draw places. A way that was not asked has a dash. `--chances` scores the answers to real pictures of `osm_unet_held_out`
+alone, so that P(false fix) is fitted on Andorra's and read off at the test places.
 """
 
 import argparse
@@ -26,8 +26,6 @@ from benchmarks.sim_to_real import estimate, line, read_scores
 from sasgeo_bench.boards.archive import request_of
 from sasgeo_bench.boards.score import score_board
 from sasgeo_bench.scoring.intervals import wilson_share
-from sasgeo_bench.scoring.rejection import judge, rules_of
-from sasgeo_bench.tasks.split import find_split
 
 SPLIT: Final = "pictures"
 SEGMENTER: Final = "osm_unet_held_out"
@@ -70,6 +68,14 @@ def percent(rows: pd.DataFrame) -> str:
     return f"{100 * rows['hit'].mean():.0f}" if len(rows) else "-"
 
 
+def with_limits(rows: pd.DataFrame) -> str:
+    """Return what is found of some rows with its interval by places, percent; a dash for none."""
+    if rows.empty:
+        return "-"
+    value, lo, hi = estimate(rows, rows["hit"])
+    return f"{value:.0f} [{lo:.0f}, {hi:.0f}]"
+
+
 def interval(rows: pd.DataFrame) -> str:
     """Return Wilson's interval of what is found, of as many sites as the rows have, percent."""
     found = wilson_share(float(rows["hit"].mean()), rows["pair_id"].nunique())
@@ -105,11 +111,7 @@ def over_places(real: pd.DataFrame, regions: Sequence[str]) -> Iterator[str]:
             if rows.empty:
                 continue
             after = of_way(rows, AFTER)
-            cells = []
-            for way in WAYS:
-                mine = of_way(rows, way)
-                value, lo, hi = estimate(mine, mine["hit"])
-                cells.append(f"{value:.0f} [{lo:.0f}, {hi:.0f}]")
+            cells = [with_limits(of_way(rows, way)) for way in WAYS]
             yield line(f"{side_m:g}", radius_m, len(after), after["place"].nunique(), *cells)
 
 
@@ -133,24 +135,21 @@ def drawn(scores: pd.DataFrame) -> Iterator[str]:
     yield line("---", *["---:"] * 3, *["---"] * len(ways))
     aerial = scores[(scores["suite"] == "aerial") & (scores["role"] != "falsifier")]
     for (look, side_m), rows in aerial.groupby(["detector", "side_m"], observed=True, sort=True):
-        cells = []
-        for way in ways:
-            mine = of_way(rows, way)
-            value, lo, hi = estimate(mine, mine["hit"])
-            cells.append(f"{value:.0f} [{lo:.0f}, {hi:.0f}]")
+        cells = [with_limits(of_way(rows, way)) for way in ways]
         after = of_way(rows, AFTER)
         yield line(look, f"{side_m:g}", len(after), after["place"].nunique(), *cells)
 
 
-def judged(board: Path) -> pd.DataFrame:
+def judged(out: Path) -> pd.DataFrame:
     """Return the answers of the way of today to real pictures at test places, with P(false fix) fitted on Andorra's."""
-    rule = rules_of((REJECTOR,), find_split(SPLIT))[REJECTOR]
+    suite = f"real-image+{SEGMENTER}"
     with TemporaryDirectory() as scratch:
-        request = request_of([board], board=Path(scratch) / "board", root=Path(scratch), split=SPLIT)
-        scored = score_board(replace(request, rejectors=()))
-    rows = scored.with_calibration[AFTER.matcher]
-    real = rows[(rows["suite"] == f"real-image+{SEGMENTER}") & (rows["role"] != "falsifier")].reset_index(drop=True)
-    return judge(real, scored.predictions[AFTER.matcher], rule.make, rule.split)
+        request = request_of(
+            [out / "runs"], board=Path(scratch) / "board", root=out, split=SPLIT, rejectors=(REJECTOR,)
+        )
+        scored = score_board(replace(request, tasks=sorted((out / "tasks" / suite).iterdir())))
+    rows = scored.judged[AFTER.matcher, REJECTOR]
+    return rows[rows["role"] != "falsifier"]
 
 
 def chances(answers: pd.DataFrame) -> Iterator[str]:
@@ -237,10 +236,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("board", type=Path)
     parser.add_argument("--figure", type=Path, help="draw it instead of printing")
-    parser.add_argument("--chances", action="store_true", help="print P(false fix) instead")
+    parser.add_argument("--chances", type=Path, help="folder of the run, to print P(false fix) instead")
     given = parser.parse_args()
-    if given.chances:
-        print("\n".join(chances(judged(given.board))))
+    if given.chances is not None:
+        print("\n".join(chances(judged(given.chances))))
         return
     scores = read_board(given.board)
     if given.figure is not None:

@@ -68,9 +68,6 @@ def tables_of_pictures():
         suites = sorted(set(scores["suite"]) - {"real-image"})
         lines += [*program["by_evidence"](scores), *program["by_difference"](scores)]
         lines += program["by_suite"](scores, suites, matcher)
-    program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "pictures.py"))
-    lines += [line for table in program["tables"](program["read_board"](RESULTS / "pictures")) for line in table]
-    lines += program["chances"](program["judged"](RESULTS / "pictures"))
     return {row.rstrip() for line in lines for row in line.splitlines()}
 
 

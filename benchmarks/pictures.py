@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Say which pictures are found: by place, ground and size of the view, before and after, with perfect masks beside.
 
-    .venv/bin/python benchmarks/pictures.py out/boards/pictures
-    .venv/bin/python benchmarks/pictures.py out/boards/pictures --figure out/pictures.svg
-    .venv/bin/python benchmarks/pictures.py out/boards/pictures --chances out
+    sasgeo-bench leaderboard pictures --out out
+    .venv/bin/python benchmarks/pictures.py out
+    .venv/bin/python benchmarks/pictures.py out --figure out/pictures.svg
+    .venv/bin/python benchmarks/pictures.py out --chances
 
-Reads `scores.parquet` of a board of `pipelines/pictures.toml`. Found is within 25 m and 5 deg; no answer is a miss.
+Scores the answers of `pipelines/pictures.toml` in `out`. Found is within 25 m and 5 deg; no answer is a miss.
 Intervals (95 %) are Wilson's of as many sites as there are, and say nothing of other places; those of all test places
 draw places. A way that was not asked has a dash. `--chances` scores the answers to real pictures of `osm_unet_held_out`
 alone, so that P(false fix) is fitted on Andorra's and read off at the test places.
@@ -25,6 +26,7 @@ import pandas as pd
 from benchmarks.sim_to_real import estimate, line, read_scores
 from sasgeo_bench.boards.archive import request_of
 from sasgeo_bench.boards.score import score_board
+from sasgeo_bench.boards.scored import Scored
 from sasgeo_bench.scoring.intervals import wilson_share
 
 SPLIT: Final = "pictures"
@@ -140,16 +142,25 @@ def drawn(scores: pd.DataFrame) -> Iterator[str]:
         yield line(look, f"{side_m:g}", len(after), after["place"].nunique(), *cells)
 
 
+def scored(out: Path, matchers: Sequence[str], suites: Sequence[str], rejectors: Sequence[str] = ()) -> Scored:
+    """Score the answers of some matchers to the tasks of some suites that lie in a folder."""
+    with TemporaryDirectory() as scratch:
+        runs = [out / "runs" / name for name in matchers]
+        request = request_of(runs, board=Path(scratch) / "board", root=out, split=SPLIT, rejectors=rejectors)
+        return score_board(replace(request, tasks=[task for name in suites for task in tasks_of(out, name)]))
+
+
+def tasks_of(out: Path, suite: str) -> list[Path]:
+    """Return the folders of a suite's tasks."""
+    return sorted(path for path in (out / "tasks" / suite).glob("*") if (path / "task.json").is_file())
+
+
 def judged(out: Path) -> pd.DataFrame:
     """Return the answers of the way of today to real pictures at test places, with P(false fix) fitted on Andorra's."""
-    suite = f"real-image+{SEGMENTER}"
-    with TemporaryDirectory() as scratch:
-        request = request_of(
-            [out / "runs"], board=Path(scratch) / "board", root=out, split=SPLIT, rejectors=(REJECTOR,)
-        )
-        scored = score_board(replace(request, tasks=sorted((out / "tasks" / suite).iterdir())))
-    rows = scored.judged[AFTER.matcher, REJECTOR]
-    return rows[rows["role"] != "falsifier"]
+    found = scored(out, [AFTER.matcher], [f"real-image+{SEGMENTER}"], [REJECTOR])
+    rows = found.judged[AFTER.matcher, REJECTOR]
+    is_again = rows["region"].astype(str).str.startswith(AGAIN)
+    return rows[(rows["role"] != "falsifier") & ~is_again]
 
 
 def chances(answers: pd.DataFrame) -> Iterator[str]:
@@ -214,15 +225,26 @@ def draw(real: pd.DataFrame, path: Path) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-def read_board(board: Path) -> pd.DataFrame:
-    """Return the rows of present places with `hit`, the segmenter, and the sides of the view and of the disc."""
-    scores = read_scores(board, 25.0, 5.0)
+def read_answers(out: Path) -> pd.DataFrame:
+    """Return the rows of present places with `hit`, the segmenter, and the sides of the view and of the disc.
+
+    Places that calibrate are among them, which no board ranks.
+    """
+    frames = []
+    for matcher in dict.fromkeys(way.matcher for way in WAYS):
+        asked = {way.segmenter for way in WAYS if way.matcher == matcher}
+        suites = [f"{suite}+{segmenter}" for suite in ("real-image", "aerial") for segmenter in asked]
+        found = scored(out, [matcher], [name for name in suites if (out / "tasks" / name).is_dir()])
+        frames += [frame.assign(matcher=name) for name, frame in found.with_calibration.items()]
+    with TemporaryDirectory() as scratch:
+        pd.concat(frames).to_parquet(Path(scratch) / "scores.parquet")
+        scores = read_scores(Path(scratch), 25.0, 5.0)
     radius_m = scores["prior_group"].astype(str).str.extract(r"r(\d+)", expand=False).astype(float)
     return scores.assign(side_m=scores["view_cells"] * scores["cell_size_m"], radius_m=radius_m)
 
 
 def tables(scores: pd.DataFrame) -> Iterator[Iterator[str]]:
-    """Yield the lines of each table, of the rows of `read_board`."""
+    """Yield the lines of each table, of the rows of `read_answers`."""
     real = scores[scores["suite"] == "real-image"]
     tests = [name for name in dict.fromkeys(real["region"]) if name not in (CALIBRATES, AGAIN)]
     yield by_place(real)
@@ -234,14 +256,14 @@ def tables(scores: pd.DataFrame) -> Iterator[Iterator[str]]:
 def main() -> None:
     """Print the tables, or draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("board", type=Path)
+    parser.add_argument("out", type=Path, help="of the run")
     parser.add_argument("--figure", type=Path, help="draw it instead of printing")
-    parser.add_argument("--chances", type=Path, help="folder of the run, to print P(false fix) instead")
+    parser.add_argument("--chances", action="store_true", help="print P(false fix) instead")
     given = parser.parse_args()
-    if given.chances is not None:
-        print("\n".join(chances(judged(given.chances))))
+    if given.chances:
+        print("\n".join(chances(judged(given.out))))
         return
-    scores = read_board(given.board)
+    scores = read_answers(given.out)
     if given.figure is not None:
         draw(scores[scores["suite"] == "real-image"], given.figure)
         return

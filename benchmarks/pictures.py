@@ -158,6 +158,10 @@ def tasks_of(out: Path, suite: str) -> list[Path]:
 def judged(out: Path) -> pd.DataFrame:
     """Return the answers of the way of today to real pictures at test places, with P(false fix) fitted on Andorra's."""
     found = scored(out, [AFTER.matcher], [f"real-image+{SEGMENTER}"], [REJECTOR])
+    if (AFTER.matcher, REJECTOR) not in found.judged:
+        raise SystemExit(
+            f"{AFTER.matcher} has not answered every task of {SEGMENTER}: sasgeo-bench leaderboard pictures"
+        )
     rows = found.judged[AFTER.matcher, REJECTOR]
     is_again = rows["region"].astype(str).str.startswith(AGAIN)
     return rows[(rows["role"] != "falsifier") & ~is_again]
@@ -179,7 +183,7 @@ def chances(answers: pd.DataFrame) -> Iterator[str]:
             yield line(f"{low:g} to {high:g}", len(rows), f"{stated:.0f}", f"{100 * false:.0f}", limits)
     yield ""
     yield line(
-        "Region", "n", "Right, %", "Half of the right kept: false among accepted, %", "Another town refused, %", "n"
+        "Region", "n", "Right, %", "Half of the right kept: false among accepted", "Another town refused, %", "n"
     )
     yield line("---", *["---:"] * 5)
     for region, rows in answers.groupby("region", observed=True):
@@ -188,7 +192,7 @@ def chances(answers: pd.DataFrame) -> Iterator[str]:
         right = present.loc[present["is_right"], "p_right"].to_numpy(float)
         least = float(np.median(right)) if len(right) else np.nan
         taken = present[present["p_right"] >= least]
-        false = "-" if taken.empty else f"{100 * (~taken['is_right']).mean():.0f} of {len(taken)}"
+        false = "-" if taken.empty else f"{100 * (~taken['is_right']).mean():.0f} % of {len(taken)}"
         refused = "-" if absent.empty else f"{100 * (~(absent['p_right'] >= least)).mean():.0f}"
         yield line(region, len(present), f"{100 * present['is_right'].mean():.0f}", false, refused, len(absent))
 

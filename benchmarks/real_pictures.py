@@ -7,7 +7,7 @@ The regions are built in `--out` and have imagery. Their pictures are cut into v
 labels are the layers of the map, roads as one class. Intervals (95 %) draw views; they say nothing of other places.
 `--weights FILE` asks other weights of `osm_unet`, `--box W,E,N,S` a part of the picture, as fractions of its sides,
 `--every N` every Nth view. `--adapt` adapts `osm_unet` without labels: `exposure` takes that of the whole picture
-instead of each view's, `mirrored` the mean with the mirrored view, `both` both.
+instead of each view's, `mirrored` the mean with the mirrored view, `both` both; of the weights of `--segmenter`.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from sasgeo_baselines.segmenters.osm_unet import WEIGHTS, Exposure, OsmUNet
+from sasgeo_baselines.segmenters.osm_unet import HELD_OUT_WEIGHTS, WEIGHTS, Exposure, OsmUNet
 
 import sasgeo_bench as sgb
 from sasgeo_bench.core.config import JsonDocument
@@ -105,6 +105,14 @@ def areas_of(counts: Sequence[PixelCounts]) -> dict[str, Area]:
     return found
 
 
+def weights_of(segmenter: str) -> Path:
+    """Return the weights of a segmenter that can be adapted; end with one line for any other."""
+    known = {"osm_unet": WEIGHTS, "osm_unet_held_out": HELD_OUT_WEIGHTS}
+    if segmenter not in known:
+        raise SystemExit(f"--adapt is of {' and '.join(known)}, got {segmenter}: leave it out, or name one of them")
+    return known[segmenter]
+
+
 def main() -> None:
     """Print a row for each region and class."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -117,13 +125,15 @@ def main() -> None:
     parser.add_argument("--adapt", choices=("exposure", "mirrored", "both"), help="of osm_unet")
     options = parser.parse_args()
     box = [float(part) for part in options.box.split(",")]
+    weights = options.weights or (weights_of(options.segmenter) if options.adapt else None)
     print("| region | class | AUC | 95 % | share | views |\n|---|---|---:|---|---:|---:|")
     for name in options.regions:
         region = sgb.read_region(options.out / "regions" / name)
-        segmenter = sgb.load_segmenter(options.segmenter)
-        if options.weights or options.adapt:
+        if weights is None:
+            segmenter = sgb.load_segmenter(options.segmenter)
+        else:
             segmenter = OsmUNet(
-                options.weights or WEIGHTS,
+                weights,
                 exposure=exposure_of(views_of(region, box)) if options.adapt in ("exposure", "both") else None,
                 is_mirrored=options.adapt in ("mirrored", "both"),
             )

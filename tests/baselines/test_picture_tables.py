@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of the experiment on pictures, of rows that are counted by hand; and whose weights are adapted."""
+
+import pandas as pd
+import pytest
+from sasgeo_baselines.segmenters.osm_unet import HELD_OUT_WEIGHTS, WEIGHTS
+
+from benchmarks.pictures import AFTER, BEFORE, PERFECT, by_place, chances
+from benchmarks.real_pictures import weights_of
+
+
+def views(way, hits, *, kind="R1 built", region="hamlet-ortho"):
+    """Rows of single views of 256 m in a disc of 250 m, a site each."""
+    return pd.DataFrame(
+        {
+            "segmenter": way.segmenter,
+            "matcher": way.matcher,
+            "region": region,
+            "kind": kind,
+            "side_m": 256.0,
+            "radius_m": 250.0,
+            "pair_id": [f"{kind} {number}" for number in range(len(hits))],
+            "hit": [float(hit) for hit in hits],
+        }
+    )
+
+
+def cells(line):
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_places_have_a_row_for_the_town_and_one_for_all_ground_with_every_way():
+    rows = [
+        views(AFTER, [1, 1, 1, 0]),
+        views(AFTER, [0], kind="R1 open"),
+        views(AFTER, [1], kind="R5 frames"),  # no single view
+        views(BEFORE, [1, 0, 0, 0]),
+        views(PERFECT, [1, 1, 1, 1]),
+    ]
+    _, _, town, every = map(cells, by_place(pd.concat(rows, ignore_index=True)))
+    assert town[:5] == ["hamlet-ortho", "built, mixed", "256", "250", "4"]
+    assert town[5:11] == ["25", "-", "-", "-", "75", "100"]
+    assert every[1:5] == ["all", "256", "250", "5"]
+    assert every[9] == "60"
+    assert town[11] == "30 to 95"  # Wilson's of 3 in 4
+
+
+def test_chances_are_counted_in_bins_and_by_what_half_of_the_right_answers_cost():
+    rows = [  # p_right, is_right, is_present
+        *[(0.99, True, True)] * 3,
+        (0.9, False, True),
+        (0.3, True, True),
+        (0.1, False, True),
+        (0.2, False, False),
+        (0.995, False, False),
+    ]
+    frame = pd.DataFrame(rows, columns=["p_right", "is_right", "is_present"])
+    frame = frame.assign(
+        is_answered=True, region="hamlet-ortho", role="stress", pair_id=[f"s{number}" for number in range(len(rows))]
+    )
+    lines = [cells(line) for line in chances(frame)]
+    bins = {line[0]: line[1:4] for line in lines if " to " in line[0]}
+    assert bins["0 to 0.05"] == ["4", "1", "25"]  # one of an absent place is false
+    assert bins["0.05 to 0.2"] == ["1", "10", "100"]
+    assert bins["0.5 to 0.8"] == ["1", "70", "0"]
+    assert bins["0.8 to 1"] == ["2", "85", "100"]
+    # Half of the four right ones have 0.99 or more: three answers, none of them false; one absent place is accepted.
+    assert lines[-1] == ["hamlet-ortho", "6", "67", "0 % of 3", "50", "2"]
+
+
+def test_what_is_adapted_are_the_weights_of_the_segmenter_that_is_named():
+    assert weights_of("osm_unet") == WEIGHTS
+    assert weights_of("osm_unet_held_out") == HELD_OUT_WEIGHTS
+    with pytest.raises(SystemExit, match="got pixel_forest: leave it out, or name one of them"):
+        weights_of("pixel_forest")

@@ -27,6 +27,7 @@ from benchmarks.sim_to_real import estimate, line, read_scores
 from sasgeo_bench.boards.archive import request_of
 from sasgeo_bench.boards.score import score_board
 from sasgeo_bench.boards.scored import Scored
+from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.scoring.intervals import wilson_share
 
 SPLIT: Final = "pictures"
@@ -276,4 +277,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except SasgeoError as error:
+        raise SystemExit(str(error)) from error

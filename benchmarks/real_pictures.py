@@ -22,6 +22,7 @@ from sasgeo_baselines.segmenters.osm_unet import HELD_OUT_WEIGHTS, WEIGHTS, Expo
 
 import sasgeo_bench as sgb
 from sasgeo_bench.core.config import JsonDocument
+from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.scoring.segmentation import PixelCounts, segmentation_scores
 from sasgeo_bench.sensing.reference_imagery import region_views
 
@@ -144,4 +145,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except SasgeoError as error:
+        raise SystemExit(str(error)) from error

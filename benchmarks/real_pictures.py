@@ -7,7 +7,8 @@ The regions are built in `--out` and have imagery. Their pictures are cut into v
 labels are the layers of the map, roads as one class. Intervals (95 %) draw views; they say nothing of other places.
 `--weights FILE` asks other weights of `osm_unet`, `--box W,E,N,S` a part of the picture, as fractions of its sides,
 `--every N` every Nth view. `--adapt` adapts `osm_unet` without labels: `exposure` takes that of the whole picture
-instead of each view's, `mirrored` the mean with the mirrored view, `both` both; of the weights of `--segmenter`.
+instead of each view's, `mirrored` the mean with the mirrored view, `both` both, `scales` the mean of the view as it is,
+smaller and larger; of the weights of `--segmenter`.
 """
 
 import argparse
@@ -32,6 +33,7 @@ SHOWN: Final = ("building", ROAD, "path_track", "railway", "water", "green", "fa
 GSD_M: Final = 0.5
 SIDE_PX: Final = 512
 THIN: Final = 4
+SCALES: Final = (0.8, 1.0, 1.25)  # of `--adapt scales`: as if pixels were so much wider
 
 
 def joined_labels(view: sgb.LabelledImage) -> sgb.LabelledImage:
@@ -74,6 +76,24 @@ def exposure_of(views: Iterator[sgb.LabelledImage]) -> Exposure:
     """Return the exposure of some views together: of a pixel in `THIN` along each axis, where there is a picture."""
     pixels = [view.image.rgb[::THIN, ::THIN][view.image.rgb[::THIN, ::THIN].any(axis=2)] for view in views]
     return Exposure.of(np.concatenate(pixels))
+
+
+class Scaled:
+    """A segmenter that sees each picture in several sizes, and says the mean of what it sees."""
+
+    def __init__(self, segmenter: sgb.Segmenter) -> None:
+        self.segmenter, self.card = segmenter, segmenter.card
+
+    def segment(self, image: sgb.AerialImage, *, learned: str | None) -> sgb.Segmentation:
+        """Return the mean of the probabilities in all sizes."""
+        found = [self.segmenter.segment(seen_from(image, scale), learned=learned) for scale in SCALES]
+        chances = np.mean([one.probabilities() for one in found], axis=0)
+        return sgb.Segmentation.of_probabilities(found[0].classes, chances)
+
+
+def seen_from(image: sgb.AerialImage, scale: float) -> sgb.AerialImage:
+    """Return a picture as if its camera had been so many times as high, so that its pixels are so much wider."""
+    return replace(image, camera=replace(image.camera, height_m=image.camera.height_m * scale))
 
 
 def counted(segmenter: sgb.Segmenter, views: Iterator[sgb.LabelledImage]) -> Iterator[PixelCounts]:
@@ -123,7 +143,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="of osm_unet, instead of those that ship")
     parser.add_argument("--box", default="0,1,0,1", help="west, east, north, south")
     parser.add_argument("--every", type=int, default=1, help="take one view of so many")
-    parser.add_argument("--adapt", choices=("exposure", "mirrored", "both"), help="of osm_unet")
+    parser.add_argument("--adapt", choices=("exposure", "mirrored", "both", "scales"), help="of osm_unet")
     options = parser.parse_args()
     box = [float(part) for part in options.box.split(",")]
     weights = options.weights or (weights_of(options.segmenter) if options.adapt else None)
@@ -138,6 +158,8 @@ def main() -> None:
                 exposure=exposure_of(views_of(region, box)) if options.adapt in ("exposure", "both") else None,
                 is_mirrored=options.adapt in ("mirrored", "both"),
             )
+            if options.adapt == "scales":
+                segmenter = Scaled(segmenter)
         counts = list(counted(segmenter, views_of(region, box, options.every)))
         for shown, area in areas_of(counts).items():
             limits = "-" if area.low is None else f"{area.low:.3f} to {area.high:.3f}"

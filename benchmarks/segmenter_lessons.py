@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple, Protocol, Self
 
 import cv2
 import numpy as np
@@ -144,6 +144,24 @@ def shade(side: int, rng: np.random.Generator) -> Planes:
     return np.asarray(expit(beyond / rng.uniform(0.01, 0.1)), dtype=np.float32)
 
 
+class Teacher(Protocol):
+    """Anything that crops come from."""
+
+    @property
+    def share(self) -> float:
+        """Return how often it is asked, of all."""
+        ...
+
+    @property
+    def is_drawn(self) -> bool:
+        """Return whether its crops are drawn: they need no other sensor."""
+        ...
+
+    def crops(self, seed: int) -> Iterator[Crop]:
+        """Return crops without end."""
+        ...
+
+
 @dataclass(frozen=True)
 class Source:
     """Where crops come from: drawn of the maps of some regions, or cut out of one picture, within `box` of it.
@@ -155,6 +173,11 @@ class Source:
     share: float
     box: Box | None = None  # None: drawn
     look: Ingredients | None = None  # None: all
+
+    @property
+    def is_drawn(self) -> bool:
+        """Return whether its crops are drawn: they need no other sensor."""
+        return self.box is None
 
     def crops(self, seed: int) -> Iterator[Crop]:
         """Return crops without end."""
@@ -181,7 +204,7 @@ def sources_of(
 
 
 def batches(
-    sources: Sequence[Source], part: int, size: int, *, steps: int = PART
+    sources: Sequence[Teacher], part: int, size: int, *, steps: int = PART
 ) -> Iterator[tuple[Planes, Planes, Planes]]:
     """Yield planes, wanted shares and weights of each step of a part, stacked over `size` crops."""
     opened = [one.crops(part * len(sources) + number) for number, one in enumerate(sources)]
@@ -191,7 +214,7 @@ def batches(
         parts = []
         for at in rng.choice(len(sources), size=size, p=shares):
             crop = next(opened[at])
-            rgb = crop.rgb if sources[at].box is None else varied(crop.rgb, rng)
+            rgb = crop.rgb if sources[at].is_drawn else varied(crop.rgb, rng)
             parts.append((normalized(rgb), *lesson(crop)))
         planes, wanted, weights = (np.stack(some) for some in zip(*parts, strict=True))
         yield planes, wanted, weights

@@ -42,7 +42,7 @@ from benchmarks.segmenter_lessons import (
     REAL,
     SIDE_PX,
     Part,
-    Source,
+    Teacher,
     batches,
     region_of,
     sources_of,
@@ -160,7 +160,7 @@ def export(net: Net, path: Path) -> None:
     onnx.save(model, path)
 
 
-def train(sources: Sequence[Source], path: Path, recipe: Recipe) -> Net:
+def train(sources: Sequence[Teacher], path: Path, recipe: Recipe) -> Net:
     """Teach a network, or go on with one; `path` keeps its state."""
     torch.manual_seed(recipe.seed)
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of the experiment on pictures, of rows that are counted by hand; and whose weights are adapted."""
 
+import numpy as np
 import pandas as pd
 import pytest
 from sasgeo_baselines.segmenters.osm_unet import HELD_OUT_WEIGHTS, WEIGHTS
 
+import sasgeo_bench as sgb
 from benchmarks.pictures import AFTER, BEFORE, PERFECT, by_place, chances
-from benchmarks.real_pictures import weights_of
+from benchmarks.real_pictures import SCALES, Scaled, weights_of
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 
 
 def views(way, hits, *, kind="R1 built", region="hamlet-ortho"):
@@ -73,3 +76,21 @@ def test_what_is_adapted_are_the_weights_of_the_segmenter_that_is_named():
     assert weights_of("osm_unet_held_out") == HELD_OUT_WEIGHTS
     with pytest.raises(SystemExit, match="got pixel_forest: leave it out, or name one of them"):
         weights_of("pixel_forest")
+
+
+class SeesWidth:
+    """A stand-in that says how wide a pixel is on the ground, as a probability."""
+
+    card = sgb.load_segmenter("osm_unet").card
+
+    def segment(self, image, *, learned):
+        width_m = float(image.camera.height_m / image.camera.intrinsics.focal_px[0])
+        return sgb.Segmentation.of_probabilities(("building",), np.full((1, *image.shape), width_m))
+
+
+def test_several_sizes_are_seen_as_from_several_heights():
+    lens = Intrinsics(width_px=4, height_px=4, focal_px=(200.0, 200.0), centre_px=(2.0, 2.0))
+    camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=100.0, yaw_deg=0.0)
+    image = sgb.AerialImage(rgb=np.zeros((4, 4, 3), dtype=np.uint8), camera=camera)
+    found = Scaled(SeesWidth()).segment(image, learned=None).probabilities()
+    np.testing.assert_allclose(found, np.full((1, 4, 4), 0.5 * np.mean(SCALES)), atol=1 / 255)

@@ -5,8 +5,10 @@
     .venv/bin/python benchmarks/pictures.py out
     .venv/bin/python benchmarks/pictures.py out --figure out/pictures.svg
     .venv/bin/python benchmarks/pictures.py out --chances
+    .venv/bin/python benchmarks/pictures.py docs/results/pictures
 
-Scores the answers of `pipelines/pictures.toml` in `out`. Found is within 25 m and 5 deg; no answer is a miss.
+Scores the answers of `pipelines/pictures.toml` in `out`, or reads those of a stored board, which ranks test places
+alone: Andorra calibrates. Found is within 25 m and 5 deg; no answer is a miss.
 Intervals (95 %) are Wilson's of as many sites as there are, and say nothing of other places; those of all test places
 draw places. A way that was not asked has a dash. `--chances` scores the answers to real pictures of `osm_unet_held_out`
 alone, so that P(false fix) is fitted on Andorra's and read off at the test places.
@@ -29,8 +31,10 @@ from sasgeo_bench.boards.score import score_board
 from sasgeo_bench.boards.scored import Scored
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.scoring.intervals import wilson_share
+from sasgeo_bench.tasks.query import RECALIBRATED
 
 SPLIT: Final = "pictures"
+SUITES: Final = ("real-image", "aerial", "corrupted-real")
 SEGMENTER: Final = "osm_unet_held_out"
 TOWN: Final = ("R1 built", "R1 mixed")
 SIDES_M: Final = (384.0, 256.0, 192.0, 128.0, 96.0)
@@ -51,6 +55,7 @@ class Way(NamedTuple):
 PERFECT: Final = Way("perfect masks", "oracle_segmenter", "sasgeo")
 BEFORE: Final = Way("before: states", "pixel_forest", "sasgeo_hard")
 AFTER: Final = Way("after", SEGMENTER, "sasgeo")
+ADAPTED: Final = Way("by the map's shares", f"{SEGMENTER}{RECALIBRATED}", "sasgeo")
 WAYS: Final = (
     BEFORE,
     Way("before: raster_soft", "pixel_forest", "raster_soft"),
@@ -129,6 +134,29 @@ def by_step(real: pd.DataFrame) -> Iterator[str]:
         step = kind if kind == "control" else f"{kind} {strength:g}" if kind.startswith("R5") else kind
         found = [percent(of_way(rows, way)) for way in WAYS]
         yield line(region, step, f"{side_m:g}", len(of_way(rows, AFTER)), *found)
+
+
+def adapted(real: pd.DataFrame) -> Iterator[str]:
+    """Yield what is found of single views as they are, and recalibrated by the shares of the map."""
+    yield line("Region", "View, m", "Disc, m", "n", AFTER.title, ADAPTED.title, "gained", "lost")
+    yield line("---", *["---:"] * 7)
+    views = real[real["kind"].str.startswith("R1")]
+    same = ["region", "side_m", "radius_m"]
+    key = [*same, "kind", "pair_id"]
+    both = of_way(views, AFTER).merge(of_way(views, ADAPTED), on=key, suffixes=("", "_adapted"), validate="1:1")
+    for (region, side_m, radius_m), rows in both.groupby(same, sort=True):
+        change = rows["hit_adapted"] - rows["hit"]
+        shares = (f"{100 * rows[name].mean():.0f}" for name in ("hit", "hit_adapted"))
+        yield line(region, f"{side_m:g}", f"{radius_m:g}", len(rows), *shares, (change > 0).sum(), (change < 0).sum())
+
+
+def spoilt(scores: pd.DataFrame) -> Iterator[str]:
+    """Yield what is found of pictures with faults, by fault and severity, beside the picture without."""
+    yield line("Fault", "Severity", "n", f"{AFTER.title}, %")
+    yield line("---", *["---:"] * 3)
+    own = of_way(scores[scores["suite"] == "corrupted-real"], AFTER)
+    for (kind, strength), rows in own.groupby(["kind", "strength"], observed=True, sort=True):
+        yield line(kind, f"{strength:g}", len(rows), percent(rows))
 
 
 def drawn(scores: pd.DataFrame) -> Iterator[str]:
@@ -230,20 +258,26 @@ def draw(real: pd.DataFrame, path: Path) -> None:
     figure.savefig(path, metadata={"Date": None})
 
 
-def read_answers(out: Path) -> pd.DataFrame:
+def read_answers(folder: Path) -> pd.DataFrame:
     """Return the rows of present places with `hit`, the segmenter, and the sides of the view and of the disc.
 
-    Places that calibrate are among them, which no board ranks.
+    Of a run, places that calibrate are among them; a stored board holds test places alone.
     """
+    if (folder / "scores.parquet").is_file():
+        return with_sides(read_scores(folder, 25.0, 5.0))
     frames = []
     for matcher in dict.fromkeys(way.matcher for way in WAYS):
-        asked = {way.segmenter for way in WAYS if way.matcher == matcher}
-        suites = [f"{suite}+{segmenter}" for suite in ("real-image", "aerial") for segmenter in asked]
-        found = scored(out, [matcher], [name for name in suites if (out / "tasks" / name).is_dir()])
+        asked = {way.segmenter for way in (*WAYS, ADAPTED) if way.matcher == matcher}
+        suites = [f"{suite}+{segmenter}" for suite in SUITES for segmenter in asked]
+        found = scored(folder, [matcher], [name for name in suites if (folder / "tasks" / name).is_dir()])
         frames += [frame.assign(matcher=name) for name, frame in found.with_calibration.items()]
     with TemporaryDirectory() as scratch:
         pd.concat(frames).to_parquet(Path(scratch) / "scores.parquet")
-        scores = read_scores(Path(scratch), 25.0, 5.0)
+        return with_sides(read_scores(Path(scratch), 25.0, 5.0))
+
+
+def with_sides(scores: pd.DataFrame) -> pd.DataFrame:
+    """Return rows with the sides of the view and of the disc, metres."""
     radius_m = scores["prior_group"].astype(str).str.extract(r"r(\d+)", expand=False).astype(float)
     return scores.assign(side_m=scores["view_cells"] * scores["cell_size_m"], radius_m=radius_m)
 
@@ -255,20 +289,22 @@ def tables(scores: pd.DataFrame) -> Iterator[Iterator[str]]:
     yield by_place(real)
     yield over_places(real, tests)
     yield by_step(real)
+    yield adapted(real)
     yield drawn(scores)
+    yield spoilt(scores)
 
 
 def main() -> None:
     """Print the tables, or draw the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path, help="of the run")
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="of the run, or of the stored board")
     parser.add_argument("--figure", type=Path, help="draw it instead of printing")
     parser.add_argument("--chances", action="store_true", help="print P(false fix) instead")
     given = parser.parse_args()
     if given.chances:
-        print("\n".join(chances(judged(given.out))))
+        print("\n".join(chances(judged(given.folder))))
         return
-    scores = read_answers(given.out)
+    scores = read_answers(given.folder)
     if given.figure is not None:
         draw(scores[scores["suite"] == "real-image"], given.figure)
         return

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint score of a list of modes, Eq. 11 of the SASGeo paper: raster, graph and contradiction."""
+"""Joint score of a list of modes, Eq. 11 of the SASGeo paper: raster, graph and contradiction; heading and scale."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -8,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 
 HALF_NODES: Final = 6.0  # a graph of so many nodes has half its weight
+_LEAST_SIGMA: Final = 1e-3  # of a scale that is known: a search still takes steps of it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,3 +63,24 @@ def columns(
         return raster
     share = nodes / (nodes + HALF_NODES)
     return np.column_stack((raster, blend.beta * share * graph, -blend.eta * contradiction(by_class)))
+
+
+def of_prior(poses: Sequence[Pose], prior: Prior) -> NDArray[np.float64]:
+    """Return what a prior says of heading and scale of each mode, nats, shape (M, 2): at most 0, at its middle.
+
+    Places are even within the disc of the prior, so that it says nothing of them.
+
+    Examples
+    --------
+    >>> north = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=20.0, scale_sigma=0.05)
+    >>> turned = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=340.0, scale=1.1)
+    >>> of_prior([turned], north).round(2).tolist()
+    [[-0.5, -1.82]]
+    """
+    scales = np.log([pose.scale for pose in poses])
+    found = np.zeros((len(poses), 2))
+    if prior.yaw_deg is not None and prior.yaw_sigma_deg is not None:
+        off_deg = wrap_deg(np.array([pose.yaw_deg for pose in poses]) - prior.yaw_deg)
+        found[:, 0] = -0.5 * (off_deg / prior.yaw_sigma_deg) ** 2
+    found[:, 1] = -0.5 * (scales / max(prior.scale_sigma, _LEAST_SIGMA)) ** 2
+    return found

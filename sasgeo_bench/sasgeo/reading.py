@@ -18,11 +18,11 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import Rarity
 from sasgeo_bench.sasgeo.graph import GraphScore, verify
-from sasgeo_bench.sasgeo.joint import columns
+from sasgeo_bench.sasgeo.joint import columns, of_prior
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, read_field, with_unknown_margins
+from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, explained, read_field, with_unknown_margins
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
@@ -290,11 +290,19 @@ class Reading:
         return None if self.graph is None else verify(self.observed, self.graph, poses, self.reader.model.rules)
 
     def terms(self, poses: Sequence[Pose], verified: Sequence[GraphScore] | None) -> NDArray[np.float64]:
-        """Return terms of Eq. 11 of each pose: see `joint.columns`."""
-        scaled = self.by_class(poses) * self.reader.model.scaling
+        """Return terms of Eq. 11 of each pose: see `joint.columns`; of a view with probabilities, two kinds besides.
+
+        They are what the map explains of each class, and what the prior says of heading and scale.
+        """
+        scaled, blend = self.by_class(poses) * self.reader.model.scaling, self.reader.model.blend
         graph = None if verified is None else np.array([one.score for one in verified])
         nodes = 0 if graph is None else len(self.observed.nodes)
-        return columns(scaled, graph, self.reader.model.blend, nodes=nodes)
+        terms = columns(scaled, graph, blend, nodes=nodes)
+        switches, seen = self.reader.switches, self.query.evidence
+        if seen.is_certain or not (switches.correlates and switches.reads_probabilities):
+            return terms
+        by_map = explained(seen, self.reader.region.classes, self.reader.field, poses)
+        return np.column_stack((terms, blend.alpha * by_map, blend.alpha * of_prior(poses, self.query.prior)))
 
     def sigma_m(self, pose: Pose) -> float:
         """Return the standard deviation of a refined position from the curvature of the raster score, metres."""

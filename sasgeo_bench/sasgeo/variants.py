@@ -237,17 +237,23 @@ _SOFT: Final = (
     "a cell seen with a probability has the logarithm of its expected likelihood ratio, so that a certain one counts "
     "as in Eq. 7"
 )
+_RANKED: Final = (
+    "modes of a view with probabilities are ranked, besides, by how well the map explains each class (its correlation, "
+    "as that of 20 independent cells) and by the prior of heading and scale"
+)
 _UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIMITS}"
 
 
 def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS, reads: str = _SOFT) -> MatcherCard:
     has_graph = bool({_GRAPH_FITTED, _GRAPH_BY_HAND}.intersection(ours))
+    is_soft, is_correlated = reads == _SOFT, _CORRELATED in ours
+    ranked = (_RANKED,) if is_soft and is_correlated else ()
     return MatcherCard(
         name=name,
-        version=str(1 + (reads == _SOFT) + (_CORRELATED in ours) + has_graph),
+        version=str(1 + is_soft + is_correlated + has_graph + len(ranked)),
         title=title,
         source=f"SASGeo paper (Trukhina and Vashkelis), {what}",
-        ours="; ".join((_OURS, reads, *ours)),
+        ours="; ".join((_OURS, reads, *ranked, *ours)),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         limits=limits,

@@ -226,8 +226,11 @@ def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
 
 
 def _add_strips(found: _Found, scored: Scored, asked: Mapping[tuple[str, str], Task]) -> None:
-    """Add for each suite of pictures some queries of the matcher that finds most of them, from picture to pose."""
-    pictured = {name: task for name, task in asked.items() if task.manifest.frames}
+    """Add for each suite of pictures some queries of the matcher that finds most of them, from picture to pose.
+
+    Flights are scored as wholes: they have their maps.
+    """
+    pictured = {name: task for name, task in asked.items() if task.manifest.frames and not task.manifest.is_of_flights}
     for suite in sorted({suite for suite, _ in pictured}):
         own = {name: task for name, task in pictured.items() if name[0] == suite}
         name = best_on_pictures(scored.scores, own)

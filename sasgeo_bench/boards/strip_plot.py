@@ -110,9 +110,11 @@ def best_on_pictures(scores: Mapping[str, pd.DataFrame], pictured: Collection[tu
 def pictured_tasks(cases: RunCases) -> tuple[tuple[str, str], ...]:
     """Return suite and region of the tasks of a run that hold pictures: those of segmenters that get nothing else.
 
-    Tasks of a control such as `oracle_segmenter` are returned if there are no others.
+    Tasks of a control such as `oracle_segmenter` are returned if there are no others, flights never: they are scored as
+    wholes.
     """
-    found = tuple(name for name, task in cases.tasks.items() if task.manifest.frames)
+    tasks = cases.tasks.items()
+    found = tuple(name for name, task in tasks if task.manifest.frames and not task.manifest.is_of_flights)
     return tuple(name for name in found if not is_unranked(name[0].partition(BY)[2])) or found
 
 

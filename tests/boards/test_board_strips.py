@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
 from sasgeo_bench.boards import board_pictures
@@ -14,6 +15,7 @@ from sasgeo_bench.boards.board_pictures import STRIP_BYTES, case_pixels, is_kept
 from sasgeo_bench.boards.build import make_board
 from sasgeo_bench.boards.publish import publish
 from sasgeo_bench.boards.scored import ScoreRequest
+from sasgeo_bench.boards.strip_plot import pictured_tasks
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
@@ -94,6 +96,20 @@ def test_a_board_on_pictures_has_a_strip_of_the_matcher_that_finds_most(board):
     path = board / "pictures" / strip["file"]
     assert path.stat().st_size <= STRIP_BYTES
     assert cv2.imread(str(path)).shape[1] > 800
+
+
+@pytest.mark.parametrize("is_of_flights", [False, True])
+def test_flights_of_pictures_have_maps_instead_of_a_strip(is_of_flights, monkeypatch):
+    rows = {"query_id": ["00ff"], "suite": "flight-image+good", "region": REGION, "role": "control", "detector": "real"}
+    scores = {"tracker": pd.DataFrame(rows | {"is_present": True, "is_right": True, "yaw_error_deg": 0.0})}
+    task = SimpleNamespace(manifest=SimpleNamespace(frames=3, is_of_flights=is_of_flights))
+    drawn = []
+    monkeypatch.setattr(board_pictures, "_cases", lambda chosen, *_: drawn.extend(chosen) or iter(()))
+    found = SimpleNamespace(add=lambda *_: None)
+    board_pictures._add_strips(found, SimpleNamespace(scores=scores), {("flight-image+good", REGION): task})
+    assert drawn == ([] if is_of_flights else [("00ff", "tracker")])
+    cases = SimpleNamespace(tasks={("flight-image+good", REGION): task})
+    assert len(pictured_tasks(cases)) == len(drawn)
 
 
 def test_no_photograph_stands_on_a_board_that_nobody_allowed_to_pass_on(tasks, tmp_path, monkeypatch):

@@ -50,7 +50,7 @@ STANDS: Final[Mapping[str, float]] = {
     "is_fitted": 1.0,
     "has_graph": float(Switches().has_graph),
     "is_unknown_silent": float(Switches().is_unknown_silent),
-    "correlates": float(Switches().correlates),
+    "correlates": float(Switches().correlates == "always"),
     "is_distinctive": float(Switches().is_distinctive),
     "level_m": raster.LEVEL_M,
     "repeated": raster.REPEATED,
@@ -78,7 +78,7 @@ class TriedSasgeo(Tunable, Sasgeo):
             weights="fitted" if at["is_fitted"] else "even",
             has_graph=bool(at["has_graph"]),
             is_unknown_silent=bool(at["is_unknown_silent"]),
-            correlates=bool(at["correlates"]),
+            correlates="always" if at["correlates"] else "never",
             is_distinctive=bool(at["is_distinctive"]),
         )
         self._level_m, self._repeated = at["level_m"], at["repeated"]

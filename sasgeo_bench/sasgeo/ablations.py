@@ -12,6 +12,7 @@ from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import Gains, even_gains, likelihood_gains
 
 Weights = Literal["even", "fitted"]
+Correlated = Literal["always", "faint", "never"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,8 +25,9 @@ class Switches:
     weight. `is_stamped`, Eq. 5 for each feature, weighs features by the time since their last edit. Unless it
     `knows_age`, every map counts as new, which separates stability from fitted weights. Unless it `learns_from_old`,
     training views on an older map are moved to the map of their own day. `burns_vectors` reads the perceived vectors as
-    a second raster view, so that an arm without a graph sees what one with a graph sees. `correlates` takes errors of
-    a class to hang together, else each cell counts alone: see `raster.RasterView.levelled` and `damped`.
+    a second raster view, so that an arm without a graph sees what one with a graph sees. `correlates` says when errors
+    of a class are taken to hang together ("faint": in views with probabilities), else each cell counts alone: see
+    `raster.RasterView.levelled` and `damped`.
     `reads_probabilities` of views that have some, else each cell is the likelier of present and absent.
     """
 
@@ -37,13 +39,17 @@ class Switches:
     knows_age: bool = True
     learns_from_old: bool = True
     burns_vectors: bool = False
-    correlates: bool = True
+    correlates: Correlated = "always"
     reads_probabilities: bool = True
 
     @property
     def learns(self) -> bool:
         """Return whether the scorer is fitted to training places."""
         return self.weights == "fitted"
+
+    def is_correlated(self, evidence: Evidence) -> bool:
+        """Return whether errors of a class in a view are taken to hang together."""
+        return self.correlates == "always" or (self.correlates == "faint" and not evidence.is_certain)
 
     def seen(self, evidence: Evidence) -> Evidence:
         """Return a view as this ablation reads it."""

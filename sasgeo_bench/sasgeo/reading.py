@@ -235,7 +235,7 @@ class Reading:
             both = [name in drawn.classes for name in reader.region.classes]
             view = view.halved_with(RasterView.of(drawn, reader.region.classes, gains), both)
         view = view.times(np.float32(seen.cell_size_m**2))
-        if reader.switches.correlates:
+        if reader.switches.is_correlated(self.query.evidence):
             view = view.levelled().damped()
         if reader.rarity is None:
             return view
@@ -299,7 +299,7 @@ class Reading:
         nodes = 0 if graph is None else len(self.observed.nodes)
         terms = columns(scaled, graph, blend, nodes=nodes)
         switches, seen = self.reader.switches, self.query.evidence
-        if seen.is_certain or not (switches.correlates and switches.reads_probabilities):
+        if seen.is_certain or not (switches.is_correlated(seen) and switches.reads_probabilities):
             return terms
         by_map = explained(seen, self.reader.region.classes, self.reader.field, poses)
         return np.column_stack((terms, blend.alpha * by_map, blend.alpha * of_prior(poses, self.query.prior)))

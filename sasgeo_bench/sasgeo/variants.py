@@ -490,7 +490,7 @@ class SasgeoIndependent(LearningMatcher):
         _SILENT,
         limits=_UNTAUGHT,
     )
-    switches = Switches(correlates=False)
+    switches = Switches(correlates="never")
 
 
 class SasgeoHard(LearningMatcher):

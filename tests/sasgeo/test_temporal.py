@@ -3,10 +3,12 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.temporal import FlightScale, increment_cost
 from sasgeo_bench.sasgeo.trackers import SasgeoTrack, SasgeoTrackAlone, SasgeoTrackOne
 from sasgeo_bench.tasks.query import Step
@@ -42,6 +44,33 @@ def test_a_flight_is_followed_and_its_covariance_holds_its_errors(region):
     for fix, pose in zip(fixes, poses, strict=True):
         gap_m = np.array([fix.pose.easting_m - pose.easting_m, fix.pose.northing_m - pose.northing_m])
         assert gap_m @ np.linalg.solve(fix.covariance[:2, :2], gap_m) < 14.0
+
+
+def faint(query, rng):
+    """A view as a segmenter sees it that is seldom sure and errs over tens of metres."""
+    seen = query.evidence
+    shape = seen.cells.shape
+    bias = np.stack([cv2.resize(rng.random((4, 4)), shape[:0:-1], interpolation=cv2.INTER_CUBIC) for _ in seen.classes])
+    chances = (0.05 + 0.5 * bias + 0.25 * (seen.cells == PRESENT)).clip(0, 1)
+    chances[seen.cells == UNKNOWN] = np.nan
+    return replace(query, evidence=Evidence.of_probabilities(seen.classes, chances, cell_size_m=seen.cell_size_m))
+
+
+class CellsAlone(SasgeoTrack):
+    """The tracker for which each cell counts alone in faint views, too."""
+
+    switches = replace(SasgeoTrack.switches, correlates="never")
+
+
+def test_a_flight_is_followed_by_faint_views_whose_errors_hang_together(region):
+    poses, rng = way_of(START, VIEWS, STEP_M), np.random.default_rng(7)
+    views = [faint(view, rng) for view in views_of(region, poses)]
+    off_m = {
+        tracker: [away_m(fix, pose) for fix, pose in zip(flown(tracker(), region, views), poses, strict=True)]
+        for tracker in (SasgeoTrack, CellsAlone)
+    }
+    assert max(off_m[SasgeoTrack][2:]) < 10.0
+    assert np.median(off_m[CellsAlone]) > 25.0
 
 
 def test_a_view_that_shows_nothing_moves_the_belief_and_a_lost_step_spreads_it(region):

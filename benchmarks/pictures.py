@@ -151,12 +151,14 @@ def adapted(real: pd.DataFrame) -> Iterator[str]:
 
 
 def spoilt(scores: pd.DataFrame) -> Iterator[str]:
-    """Yield what is found of pictures with faults, by fault and severity, beside the picture without."""
-    yield line("Fault", "Severity", "n", f"{AFTER.title}, %")
+    """Yield what is found of pictures with faults, by family and severity, beside the pictures without."""
+    yield line("Faults", "Severity", "n", f"{AFTER.title}, %")
     yield line("---", *["---:"] * 3)
     own = of_way(scores[scores["suite"] == "corrupted-real"], AFTER)
-    for (kind, strength), rows in own.groupby(["kind", "strength"], observed=True, sort=True):
-        yield line(kind, f"{strength:g}", len(rows), percent(rows))
+    own = own[own["role"] != "falsifier"]
+    families = own["kind"].str.partition(" ")[0]  # as in "weather fog"
+    for (family, strength), rows in own.groupby([families, "strength"], observed=True, sort=True):
+        yield line(family, f"{strength:g}", len(rows), percent(rows))
 
 
 def drawn(scores: pd.DataFrame) -> Iterator[str]:

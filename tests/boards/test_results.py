@@ -60,7 +60,7 @@ def test_stored_truths_are_of_the_detectors_that_the_pipeline_names(name):
 
 @pytest.fixture(scope="module")
 def tables_of_pictures():
-    """The lines that the program of the page on pictures prints of its boards."""
+    """The lines that the programs of the page on pictures print of its boards."""
     program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "sim_to_real.py"))
     lines = []
     for board, matcher in (("aerial", "sasgeo"), ("aerial-soft", "raster_soft")):
@@ -68,6 +68,9 @@ def tables_of_pictures():
         suites = sorted(set(scores["suite"]) - {"real-image"})
         lines += [*program["by_evidence"](scores), *program["by_difference"](scores)]
         lines += program["by_suite"](scores, suites, matcher)
+    program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "pictures.py"))
+    for table in program["tables"](program["read_answers"](RESULTS / "pictures")):
+        lines += table
     return {row.rstrip() for line in lines for row in line.splitlines()}
 
 

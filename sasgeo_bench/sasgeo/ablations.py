@@ -27,8 +27,8 @@ class Switches:
     training views on an older map are moved to the map of their own day. `burns_vectors` reads the perceived vectors as
     a second raster view, so that an arm without a graph sees what one with a graph sees. `correlates` says when errors
     of a class are taken to hang together ("faint": in views with probabilities), else each cell counts alone: see
-    `raster.RasterView.levelled` and `damped`.
-    `reads_probabilities` of views that have some, else each cell is the likelier of present and absent.
+    `raster.RasterView.levelled` and `damped`. `reads_probabilities` of views that have some, else each cell is the
+    likelier of present and absent.
     """
 
     weights: Weights = "fitted"

@@ -18,7 +18,14 @@ from sasgeo_bench.sasgeo.conformal import levels_of
 from sasgeo_bench.sasgeo.graph import GraphScore
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
 from sasgeo_bench.sasgeo.learning import learn
-from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, likeness_by_hand, read_field, with_unknown_margins
+from sasgeo_bench.sasgeo.raster import (
+    CELL_M,
+    INDEPENDENT,
+    RasterView,
+    likeness_by_hand,
+    read_field,
+    with_unknown_margins,
+)
 from sasgeo_bench.sasgeo.rates import hand_rates
 from sasgeo_bench.sasgeo.reading import Reader, Reading
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
@@ -239,7 +246,7 @@ _SOFT: Final = (
 )
 _RANKED: Final = (
     "modes of a view with probabilities are ranked, besides, by how well the map explains each class (its correlation, "
-    "as that of 20 independent cells) and by the prior of heading and scale"
+    f"as that of {INDEPENDENT:g} independent cells) and by the prior of heading and scale"
 )
 _UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIMITS}"
 

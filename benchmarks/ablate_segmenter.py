@@ -32,7 +32,7 @@ from sasgeo_baselines.segmenters.osm_unet import OsmUNet
 
 import sasgeo_bench as sgb
 from benchmarks.real_pictures import GSD_M, SIDE_PX, Area, areas_of, counted, part_of, views_of
-from benchmarks.segmenter_lessons import DRAWN, HELD, PART, REAL, Part, Source, region_of, sources_of
+from benchmarks.segmenter_lessons import DRAWN, HELD, PART, REAL, Part, Source, region_of, sources_of, trainer
 from sasgeo_bench.core.config import JsonDocument
 from sasgeo_bench.core.errors import SasgeoError, StoreError
 from sasgeo_bench.core.folders import fresh_file
@@ -162,14 +162,14 @@ def check_untaught(sources: Sequence[Source], places: Sequence[Part], out: Path)
 
 def carry_out(arm: str, plan: Plan) -> None:
     """Teach an arm, ask it, and keep what it sees."""
-    from benchmarks.train_segmenter import Recipe, export, train  # noqa: PLC0415 - needs PyTorch
-
+    teach = trainer()
     sources, state, weights = ARMS[arm].sources(plan.out), plan.path(arm, ".pt"), plan.path(arm, ".onnx")
     check_untaught(sources, plan.places, plan.out)
     state.parent.mkdir(parents=True, exist_ok=True)
     began = time.perf_counter()
     print(f"{arm} {'goes on' if state.exists() else 'begins'}", flush=True)
-    export(train(sources, state, Recipe(steps=plan.steps, part=min(PART, plan.steps), seed=ARMS[arm].seed)), weights)
+    recipe = teach.Recipe(steps=plan.steps, part=min(PART, plan.steps), seed=ARMS[arm].seed)
+    teach.export(teach.train(sources, state, recipe), weights)
     segmenter, places = OsmUNet(weights), {}
     for part in plan.places:
         region = region_of(part.region, plan.out)
@@ -227,7 +227,10 @@ def main() -> None:
             if plan.result(arm) is None:
                 with redirect_stdout(sys.stderr):
                     carry_out(arm, plan)
-        print(table({arm: result for arm in ARMS if (result := plan.result(arm))}))
+        results = {arm: result for arm in ARMS if (result := plan.result(arm))}
+        if is_table and not results:
+            raise SystemExit(f"no arm of {plan.steps} steps is done in {plan.out / FOLDER}: leave --table out, once")
+        print(table(results))
     except SasgeoError as error:
         raise SystemExit(str(error)) from error
 

@@ -141,6 +141,10 @@ def main() -> None:
     parser.add_argument("regions", nargs="+")
     parser.add_argument("--flights", action="store_true", help="follow flights instead")
     given = parser.parse_args()
+    suite = FLIGHTS if given.flights else SUITE
+    for name in given.regions:
+        if not (given.out / "tasks" / suite / name).is_dir():
+            raise SystemExit(f"{given.out} holds no views of {suite} on {name}: sasgeo-bench leaderboard pictures")
     if given.flights:
         for name in given.regions:
             print_flights(given.out, name)

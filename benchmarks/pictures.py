@@ -173,6 +173,12 @@ def drawn(scores: pd.DataFrame) -> Iterator[str]:
         yield line(look, f"{side_m:g}", len(after), after["place"].nunique(), *cells)
 
 
+def check_run(out: Path) -> None:
+    """End with one line if the answers of the pipeline are not in a folder."""
+    if not all((out / "runs" / way.matcher).is_dir() for way in WAYS):
+        raise SystemExit(f"{out} holds no answers of `pictures`: sasgeo-bench leaderboard pictures --out {out}")
+
+
 def scored(out: Path, matchers: Sequence[str], suites: Sequence[str], rejectors: Sequence[str] = ()) -> Scored:
     """Score the answers of some matchers to the tasks of some suites that lie in a folder."""
     with TemporaryDirectory() as scratch:
@@ -188,6 +194,7 @@ def tasks_of(out: Path, suite: str) -> list[Path]:
 
 def judged(out: Path) -> pd.DataFrame:
     """Return the answers of the way of today to real pictures at test places, with P(false fix) fitted on Andorra's."""
+    check_run(out)
     found = scored(out, [AFTER.matcher], [f"real-image+{SEGMENTER}"], [REJECTOR])
     if (AFTER.matcher, REJECTOR) not in found.judged:
         raise SystemExit(
@@ -266,7 +273,11 @@ def read_answers(folder: Path) -> pd.DataFrame:
     Of a run, places that calibrate are among them; a stored board holds test places alone.
     """
     if (folder / "scores.parquet").is_file():
-        return with_sides(read_scores(folder, 25.0, 5.0))
+        scores = read_scores(folder, 25.0, 5.0)
+        if of_way(scores, AFTER).empty:
+            raise SystemExit(f"{folder} is no board of `pictures`: name the folder of the run, or of that board")
+        return with_sides(scores)
+    check_run(folder)
     frames = []
     for matcher in dict.fromkeys(way.matcher for way in WAYS):
         asked = {way.segmenter for way in (*WAYS, ADAPTED) if way.matcher == matcher}

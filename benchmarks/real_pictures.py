@@ -1,17 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Say how well a segmenter orders the pixels of real pictures: the area under the ROC curve, class by class.
 
-    .venv/bin/python benchmarks/real_pictures.py --out out pardubice-ortho chateaugiron-ortho
+    .venv/bin/python benchmarks/real_pictures.py --out out chateaugiron-ortho koeln-ortho
 
 The regions are built in `--out` and have imagery. Their pictures are cut into views of 256 m, north up, without gaps;
-labels are the layers of the map, roads as one class. Intervals (95 %) draw views; they say nothing of other places.
-`--weights FILE` asks other weights of `osm_unet`, `--box W,E,N,S` a part of the picture, as fractions of its sides,
-`--every N` every Nth view. `--adapt` adapts `osm_unet` without labels: `exposure` takes that of the whole picture
+labels are the layers of the map, roads as one class: `road` is `road_major` or `road_minor`. Intervals (95 %) draw
+views; they say nothing of other places. A place whose picture taught the segmenter is named.
+`--weights FILE` asks other weights of the network, `--box W,E,N,S` a part of the picture, as fractions of its sides,
+`--every N` every Nth view. `--adapt` adapts the network without labels: `exposure` takes that of the whole picture
 instead of each view's, `mirrored` the mean with the mirrored view, `both` both, `scales` the mean of the view as it is,
 smaller and larger; of the weights of `--segmenter`.
 """
 
 import argparse
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -24,6 +26,7 @@ from sasgeo_baselines.segmenters.osm_unet import HELD_OUT_WEIGHTS, WEIGHTS, Expo
 import sasgeo_bench as sgb
 from sasgeo_bench.core.config import JsonDocument
 from sasgeo_bench.core.errors import SasgeoError
+from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.scoring.segmentation import PixelCounts, segmentation_scores
 from sasgeo_bench.sensing.reference_imagery import region_views
 
@@ -33,6 +36,9 @@ SHOWN: Final = ("building", ROAD, "path_track", "railway", "water", "green", "fa
 GSD_M: Final = 0.5
 SIDE_PX: Final = 512
 THIN: Final = 4
+
+Box = tuple[float, float, float, float]  # of a picture, fractions of its sides: west, east, north, south
+WHOLE: Final[Box] = (0.0, 1.0, 0.0, 1.0)
 SCALES: Final = (0.8, 1.0, 1.25)  # of `--adapt scales`: as if pixels were so much wider
 
 
@@ -54,6 +60,26 @@ def joined_answer(found: sgb.Segmentation) -> sgb.Segmentation:
     at = [found.classes.index(name) for name in ROADS if name in found.classes]
     road = 1 - np.prod(1 - chances[at], axis=0, keepdims=True)
     return sgb.Segmentation.of_probabilities((*found.classes, ROAD), np.concatenate([chances, road]))
+
+
+def box_of(text: str) -> Box:
+    """Read west, east, north and south of a part of a picture, fractions of its sides."""
+    try:
+        west, east, north, south = map(float, text.split(","))
+    except ValueError:
+        west = east = north = south = 0.0
+    if not (0 <= west < east <= 1 and 0 <= north < south <= 1):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no part of a picture: give WEST,EAST,NORTH,SOUTH, fractions from 0 to 1"
+        )
+    return west, east, north, south
+
+
+def positive(text: str) -> int:
+    """Read a whole number of at least 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least 1")
+    return int(text)
 
 
 def part_of(region: sgb.Region, box: Sequence[float]) -> tuple[float, float, float, float]:
@@ -139,17 +165,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("regions", nargs="+")
     parser.add_argument("--out", type=Path, default=Path("out"))
-    parser.add_argument("--segmenter", default="osm_unet", help="name of one that needs no training")
+    parser.add_argument("--segmenter", default="osm_unet_held_out", help="name of one that needs no training")
     parser.add_argument("--weights", type=Path, help="of osm_unet, instead of those that ship")
-    parser.add_argument("--box", default="0,1,0,1", help="west, east, north, south")
-    parser.add_argument("--every", type=int, default=1, help="take one view of so many")
+    parser.add_argument("--box", type=box_of, default=WHOLE, help="west, east, north, south, fractions from 0 to 1")
+    parser.add_argument("--every", type=positive, default=1, help="take one view of so many")
     parser.add_argument("--adapt", choices=("exposure", "mirrored", "both", "scales"), help="of osm_unet")
     options = parser.parse_args()
-    box = [float(part) for part in options.box.split(",")]
+    box = options.box
+    regions = {name: sgb.read_region(options.out / "regions" / name) for name in options.regions}
     weights = options.weights or (weights_of(options.segmenter) if options.adapt else None)
     print("| region | class | AUC | 95 % | share | views |\n|---|---|---:|---|---:|---:|")
-    for name in options.regions:
-        region = sgb.read_region(options.out / "regions" / name)
+    for name, region in regions.items():
         if weights is None:
             segmenter = sgb.load_segmenter(options.segmenter)
         else:
@@ -160,6 +186,8 @@ def main() -> None:
             )
             if options.adapt == "scales":
                 segmenter = Scaled(segmenter)
+        if weights is None and any(name.startswith(place) for place in segmenter.card.trained_on):
+            print(f"{name} taught {segmenter.card.name}: this is no figure of a new place", file=sys.stderr)
         counts = list(counted(segmenter, views_of(region, box, options.every)))
         for shown, area in areas_of(counts).items():
             limits = "-" if area.low is None else f"{area.low:.3f} to {area.high:.3f}"
@@ -169,5 +197,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except SasgeoError as error:
-        raise SystemExit(str(error)) from error
+    except (SasgeoError, ValueError) as error:  # ValueError: a segmenter that needs training, weights that are none
+        raise SystemExit(one_line(str(error))) from error

@@ -8,7 +8,9 @@ import argparse
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Final, NamedTuple, Protocol, Self
 
 import cv2
@@ -19,7 +21,7 @@ from sasgeo_baselines.segmenters.osm_unet import CLASSES, normalized
 from scipy.special import expit
 
 import sasgeo_bench as sgb
-from benchmarks.real_pictures import part_of
+from benchmarks.real_pictures import WHOLE, Box, box_of, part_of
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.sensing.crops import Crop, drawn_crops, real_crops
 from sasgeo_bench.sensing.rendering.wild import Ingredients
@@ -36,33 +38,34 @@ SHADED: Final = 0.15  # of real crops: steep valleys are half in the shade
 
 Pixels = NDArray[np.uint8]
 Planes = NDArray[np.float32]
-Box = tuple[float, float, float, float]  # of a picture, fractions of its sides: west, east, north, south
 
 
 class Part(NamedTuple):
     """A part of the picture over a region."""
 
     region: str
-    box: Box = (0.0, 1.0, 0.0, 1.0)
+    box: Box = WHOLE
 
     @classmethod
     def parse(cls, text: str) -> Self:
         """Read NAME or NAME:WEST,EAST,NORTH,SOUTH."""
         name, colon, numbers = text.partition(":")
         try:
-            west, east, north, south = map(float, numbers.split(",")) if colon else cls(name).box
-            is_box = 0 <= west < east <= 1 and 0 <= north < south <= 1
-        except ValueError:
-            is_box = False
-        if not (name and is_box):
+            return cls(_named(name), box_of(numbers) if colon else WHOLE)
+        except argparse.ArgumentTypeError as error:
             raise argparse.ArgumentTypeError(
                 f"{text!r} is no part of a picture: give NAME or NAME:WEST,EAST,NORTH,SOUTH, fractions from 0 to 1"
-            )
-        return cls(name, (west, east, north, south))
+            ) from error
 
     def __str__(self) -> str:
         numbers = ",".join(f"{at:g}" for at in self.box)
         return self.region if self.box == Part(self.region).box else f"{self.region}:{numbers}"
+
+
+def _named(name: str) -> str:
+    if not name:
+        raise argparse.ArgumentTypeError("a part of a picture has a name")
+    return name
 
 
 # Maps that are drawn: one place at least of each train country of the split `world`, but those under pictures.
@@ -218,6 +221,14 @@ def batches(
             parts.append((normalized(rgb), *lesson(crop)))
         planes, wanted, weights = (np.stack(some) for some in zip(*parts, strict=True))
         yield planes, wanted, weights
+
+
+def trainer() -> ModuleType:
+    """Return `train_segmenter`; end with one line where what it needs is missing."""
+    try:
+        return import_module("benchmarks.train_segmenter")
+    except ModuleNotFoundError as error:
+        raise SystemExit(f"{error.name} is missing, which teaching needs: .venv/bin/pip install torch onnx") from error
 
 
 def region_of(name: str, out: Path) -> sgb.Region:

@@ -30,7 +30,18 @@ from sasgeo_baselines.segmenters.osm_unet import OsmUNet, OsmUNetHeldOut
 import sasgeo_bench as sgb
 from benchmarks.real_pictures import GSD_M, Area, areas_of, counted, part_of, views_of
 from benchmarks.real_pictures import SIDE_PX as VIEW_PX
-from benchmarks.segmenter_lessons import DRAWN, PIXEL_M, REAL, SIDE_PX, Box, Source, Teacher, region_of, sources_of
+from benchmarks.segmenter_lessons import (
+    DRAWN,
+    PIXEL_M,
+    REAL,
+    SIDE_PX,
+    Box,
+    Source,
+    Teacher,
+    region_of,
+    sources_of,
+    trainer,
+)
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.sensing.crops import Crop
@@ -194,8 +205,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000, help="of 4 crops")
     parser.add_argument("--rate", type=float, default=3e-4, help="of learning, at its highest")
     given = parser.parse_args()
-    from benchmarks.train_segmenter import Recipe, export, train  # noqa: PLC0415 - needs PyTorch
-
+    if not given.begin.is_file():
+        parser.error(f"there is no {given.begin}: train_segmenter.py leaves the state of its network there")
+    teach = trainer()
     region, folder = region_of(given.region, given.out), given.out / "segmenters" / "self_train"
     folder.mkdir(parents=True, exist_ok=True)
     views = list(answered(region, WEST))
@@ -207,8 +219,8 @@ def main() -> None:
     teachers = sources_of(DRAWN, REAL, 0.3, given.out)
     for way, sources in ways_of(views, given.least, teachers).items():
         kept = folder / f"{given.region}-{way}-{given.steps}"
-        recipe = Recipe(steps=given.steps, rate=given.rate, begin=given.begin, part=PART)
-        export(train(sources, kept.with_suffix(".pt"), recipe), kept.with_suffix(".onnx"))
+        recipe = teach.Recipe(steps=given.steps, rate=given.rate, begin=given.begin, part=PART)
+        teach.export(teach.train(sources, kept.with_suffix(".pt"), recipe), kept.with_suffix(".onnx"))
         counts = list(counted(OsmUNet(kept.with_suffix(".onnx")), views_of(region, EAST)))
         print(row(way, areas_of(counts), len(counts)), flush=True)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from PIL import Image
 
 import sasgeo_bench as sgb
 from docs.site import reference
@@ -155,6 +156,17 @@ def test_the_segmenter_of_the_guide_keeps_to_the_door():
     made: dict[str, object] = {}
     exec(first, made)  # noqa: S102 - of our own documents
     assert sgb.check_segmentation(made["found"], made["picture"]) is made["found"]
+
+
+def test_a_picture_of_ones_own_is_seen_as_the_card_says(tmp_path, monkeypatch):
+    text = read(DOCS / "concepts" / "osm-unet.md")
+    (_, code) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    Image.fromarray(np.random.default_rng(1).integers(0, 256, (96, 128, 3), dtype=np.uint8)).save("mine.png")
+    made: dict[str, object] = {}
+    exec(code, made)  # noqa: S102 - of our own documents
+    assert made["building"].shape == (96, 128)  # type: ignore[attr-defined]
+    assert Image.open("seen.png").size == (128, 96)
 
 
 def test_the_readme_is_read_in_two_minutes():

@@ -141,6 +141,10 @@ def _to_rgb(image: Image.Image, name: str, *, is_tiff: bool) -> Picture:
     return np.array(image.convert("RGB"), dtype=np.uint8)
 
 
+_AXES: Final = 3  # of a picture: rows, columns, bands
+_FAR_M: Final = 1000.0  # height of the camera of an orthophoto, in which nothing leans
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AerialImage:
     """A picture from the air, and what is believed of the camera that took it.
@@ -184,6 +188,42 @@ class AerialImage:
             if not (np.isfinite(value) and value >= 0):
                 raise ImageError(f"{name} must be finite and not negative, got {value!r}")
         self.rgb.flags.writeable = False
+
+    @classmethod
+    def from_above(cls, rgb: Picture, *, gsd_m: float) -> Self:
+        """Make an image of a picture from straight above, such as a part of an orthophoto.
+
+        Parameters
+        ----------
+        rgb : ndarray of uint8, shape (H, W, 3)
+            Red, green, blue; it is made read-only.
+        gsd_m : float
+            Width of a pixel on the ground, metres. A segmenter goes by it: with half of it streets look like rivers.
+
+        Raises
+        ------
+        ImageError
+            If the picture is no 8-bit RGB, or `gsd_m` is not positive and finite.
+
+        Examples
+        --------
+        >>> seen = AerialImage.from_above(np.zeros((400, 300, 3), dtype=np.uint8), gsd_m=0.25)
+        >>> seen.shape, seen.camera.height_m / seen.camera.intrinsics.focal_px[0]
+        ((400, 300), 0.25)
+        """
+        if rgb.ndim != _AXES or rgb.size == 0:
+            raise ImageError(f"rgb is uint8 of shape (H, W, 3), got {rgb.dtype} of shape {rgb.shape}")
+        if not (np.isfinite(gsd_m) and gsd_m > 0):
+            raise ImageError(f"gsd_m, the width of a pixel on the ground, is positive and finite, got {gsd_m!r}")
+        rows, cols = rgb.shape[:2]
+        lens = Intrinsics(
+            width_px=cols,
+            height_px=rows,
+            focal_px=(_FAR_M / gsd_m, _FAR_M / gsd_m),
+            centre_px=(cols / 2, rows / 2),
+        )
+        camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=_FAR_M, yaw_deg=0.0)
+        return cls(rgb=rgb, camera=camera)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -521,12 +521,13 @@ def _to_grid(lon_deg: float, lat_deg: float, epsg: int) -> tuple[float, float, f
     return here_m, low_m, float(bearing_deg(sign * (there_m - here_m), sign * (high_m - low_m)))
 
 
-def read_photo(path: Path, *, most_bytes: int = MOST_BYTES, most_pixels: int = 200_000_000) -> Photo:
+def read_photo(path: str | Path, *, most_bytes: int = MOST_BYTES, most_pixels: int = 200_000_000) -> Photo:
     """Read the metadata of a drone's photo (JPEG, TIFF, DNG); raise `ImageError` if it is no sound photo.
 
     Nothing is decoded; limits are on the bytes of the file and the pixels that its head announces. What a file does not
     say is None, so that a photo without pose is refused only where its pose is asked for (`Photo.camera`).
     """
+    path = Path(path)
     size = path.stat().st_size if path.is_file() else 0  # what is no file is refused when it is opened
     if size > most_bytes:
         raise ImageError(f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first")

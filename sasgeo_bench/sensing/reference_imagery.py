@@ -27,7 +27,6 @@ from sasgeo_bench.regions.layers import OUTSIDE, Paint, burn_layers, make_paint
 from sasgeo_bench.regions.ortho import OrthoTile, lattice_within, write_tiles
 from sasgeo_bench.regions.region import LICENCE, Manifest, Region
 from sasgeo_bench.regions.region_spec import RegionFile
-from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun
 from sasgeo_bench.sensing.rendering.palettes import PALETTES, Family
@@ -40,7 +39,6 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
 LEAST_LABELLED: Final = 0.25  # fraction of a view; one that shows less of the mapped area is left out
-_FAR_M: Final = 1000.0  # height of the camera of a mosaic, in which nothing leans
 
 
 def part_bounds_m(spec: RegionFile, *, epsg: int) -> tuple[Bounds, ...]:
@@ -124,15 +122,7 @@ def _view(imagery: Imagery, classes: tuple[str, ...], paint: Paint, grid: Grid, 
     right_m, up_m = imagery.off_m
     labels = burn_layers(paint, replace(grid, west_m=grid.west_m - right_m, north_m=grid.north_m - up_m))
     labels[(labels == OUTSIDE) | ~shown.is_known] = UNKNOWN
-    focal_px = _FAR_M / grid.cell_size_m
-    lens = Intrinsics(
-        width_px=grid.cols,
-        height_px=grid.rows,
-        focal_px=(focal_px, focal_px),
-        centre_px=(grid.cols / 2, grid.rows / 2),
-    )
-    camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=_FAR_M, yaw_deg=0.0)
-    image = AerialImage(rgb=np.ascontiguousarray(shown.rgb), camera=camera)
+    image = AerialImage.from_above(np.ascontiguousarray(shown.rgb), gsd_m=grid.cell_size_m)
     return LabelledImage(image=image, classes=classes, labels=labels, place=place)
 
 

@@ -200,7 +200,8 @@ def test_an_arm_that_is_cut_off_keeps_its_state_and_no_result(out, stand_in, mon
     with pytest.raises(KeyboardInterrupt):
         call(monkeypatch, out)
     assert [path.name for path in (out / "segmenters" / "ablations").iterdir()] == ["north-20.pt"]
-    call(monkeypatch, out, "--table")
+    with pytest.raises(SystemExit, match=r"^no arm of 20 steps is done in "):
+        call(monkeypatch, out, "--table")
     assert "north" not in capsys.readouterr().out
     stand_in.is_cut = False
     call(monkeypatch, out)

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of the experiment on pictures, of rows that are counted by hand; and whose weights are adapted."""
 
+import argparse
+
 import numpy as np
 import pandas as pd
 import pytest
 from sasgeo_baselines.segmenters.osm_unet import HELD_OUT_WEIGHTS, WEIGHTS
 
 import sasgeo_bench as sgb
-from benchmarks.pictures import AFTER, BEFORE, PERFECT, by_place, chances
-from benchmarks.real_pictures import SCALES, Scaled, weights_of
+from benchmarks.pictures import ADAPTED, AFTER, BEFORE, PERFECT, adapted, by_place, chances, read_answers, spoilt
+from benchmarks.real_pictures import SCALES, Scaled, box_of, weights_of
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 
 
@@ -46,6 +48,21 @@ def test_places_have_a_row_for_the_town_and_one_for_all_ground_with_every_way():
     assert every[1:5] == ["all", "256", "250", "5"]
     assert every[9] == "60"
     assert town[11] == "30 to 95"  # Wilson's of 3 in 4
+
+
+def test_what_shares_gain_and_lose_is_counted_view_by_view():
+    after, by_shares = views(AFTER, [1, 1, 0, 0]), views(ADAPTED, [1, 0, 1, 1])
+    lines = list(map(cells, adapted(pd.concat([after, by_shares], ignore_index=True))))
+    assert lines[2:] == [["hamlet-ortho", "256", "250", "4", "50", "75", "2", "1"]]
+
+
+def test_faults_are_counted_by_family():
+    rows = [
+        views(AFTER, [1, 0], kind=kind).assign(suite="corrupted-real", strength=2.0, role="stress")
+        for kind in ("weather fog", "weather rain", "compound fog + jpeg")
+    ]
+    lines = list(map(cells, spoilt(pd.concat(rows, ignore_index=True))))
+    assert lines[2:] == [["compound", "2", "2", "50"], ["weather", "2", "4", "50"]]
 
 
 def test_chances_are_counted_in_bins_and_by_what_half_of_the_right_answers_cost():
@@ -95,3 +112,14 @@ def test_several_sizes_are_seen_as_from_several_heights():
     image = sgb.AerialImage(rgb=np.zeros((4, 4, 3), dtype=np.uint8), camera=camera)
     found = Scaled(SeesWidth()).segment(image, learned=None).probabilities()
     np.testing.assert_allclose(found, np.full((1, 4, 4), 0.5 * np.mean(SCALES)), atol=1 / 255)
+
+
+@pytest.mark.parametrize("text", ["0,1,0.8", "0,1,0.5,0.5", "0,2,0,1", "west,1,0,1"])
+def test_what_is_no_part_of_a_picture_is_refused(text):
+    with pytest.raises(argparse.ArgumentTypeError, match=r"is no part of a picture: give WEST,EAST,NORTH,SOUTH"):
+        box_of(text)
+
+
+def test_a_folder_without_answers_is_named_with_the_command_that_makes_them(tmp_path):
+    with pytest.raises(SystemExit, match=r"holds no answers of `pictures`: sasgeo-bench leaderboard pictures --out "):
+        read_answers(tmp_path)

@@ -4,15 +4,18 @@
 import struct
 import zlib
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from PIL import Image
 
 from sasgeo_bench.core.errors import ImageError
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
+from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, decode_image
 
 RED, GREEN, BLUE = (250, 0, 0), (0, 250, 0), (0, 0, 250)
@@ -204,3 +207,25 @@ def test_infrared_in_a_tiff_that_calls_itself_alpha_does_not_darken_the_picture(
     mask = np.full((20, 20), 255, np.uint8)
     mask[:3], mask[3] = 0, 128
     assert decode_image(tiff_of(mask))[:, 0, 0].tolist() == [0] * 3 + [45] + [90] * 16
+
+
+def test_a_picture_from_straight_above_has_pixels_of_the_width_that_is_said() -> None:
+    rgb = np.zeros((40, 30, 3), dtype=np.uint8)
+    image = AerialImage.from_above(rgb, gsd_m=0.28)
+    at_m = image.camera.unproject(np.array([[15.0, 20.0], [16.0, 20.0], [15.0, 19.0]]), Plane())
+    np.testing.assert_allclose(at_m[:, :2], [[0, 0], [0.28, 0], [0, 0.28]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("rgb", "gsd_m", "words"),
+    [
+        (np.zeros((4, 4, 3), dtype=np.uint8), 0.0, r"gsd_m, the width of a pixel on the ground, is positive"),
+        (np.zeros((4, 4, 3), dtype=np.uint8), np.nan, r"gsd_m, the width of a pixel on the ground, is positive"),
+        (np.zeros((4, 4), dtype=np.uint8), 0.5, r"rgb is uint8 of shape \(H, W, 3\), got uint8 of shape \(4, 4\)"),
+        (np.zeros((4, 4, 4), dtype=np.uint8), 0.5, r"rgb is uint8 of shape"),
+        (np.zeros((4, 4, 3)), 0.5, r"rgb is uint8 of shape"),
+    ],
+)
+def test_what_is_no_picture_from_above_is_refused(rgb: NDArray[Any], gsd_m: float, words: str) -> None:
+    with pytest.raises(ImageError, match=words):
+        AerialImage.from_above(rgb, gsd_m=gsd_m)

@@ -73,7 +73,7 @@ def test_place_height_angles_and_focal_length_are_read(photo_path, as_elements):
 
 
 def test_the_camera_of_a_photo_heads_by_the_grid(photo_path):
-    camera = read_photo(write_photo(photo_path)).camera()
+    camera = read_photo(str(write_photo(photo_path))).camera()
     assert camera.height_m == 50.0
     assert camera.tilt_deg == pytest.approx(30.0)
     # West of the zone's meridian (9 E) grid north lies west of true north: (8.5 - 9) sin(47.375) = -0.368 degrees.

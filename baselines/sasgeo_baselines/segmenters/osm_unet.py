@@ -128,7 +128,10 @@ def _working_picture(image: sgb.AerialImage) -> tuple[NDArray[np.uint8], float]:
 
 @lru_cache(maxsize=1)
 def _network(weights: Path) -> cv2.dnn.Net:
-    return cv2.dnn.readNetFromONNX(str(weights))
+    try:
+        return cv2.dnn.readNetFromONNX(str(weights))
+    except cv2.error as error:
+        raise ValueError(f"{weights} holds no network that OpenCV reads: name an ONNX file") from error
 
 
 def _log_odds(network: cv2.dnn.Net, planes: Plane, *, is_mirrored: bool) -> Plane:

@@ -54,11 +54,12 @@ class Way(NamedTuple):
 
 PERFECT: Final = Way("perfect masks", "oracle_segmenter", "sasgeo")
 BEFORE: Final = Way("before: states", "pixel_forest", "sasgeo_hard")
+BEFORE_SOFT: Final = Way("before: raster_soft", "pixel_forest", "raster_soft")
 AFTER: Final = Way("after", SEGMENTER, "sasgeo")
 ADAPTED: Final = Way("by the map's shares", f"{SEGMENTER}{RECALIBRATED}", "sasgeo")
 WAYS: Final = (
     BEFORE,
-    Way("before: raster_soft", "pixel_forest", "raster_soft"),
+    BEFORE_SOFT,
     Way("osm_unet: states", SEGMENTER, "sasgeo_hard"),
     Way("osm_unet: raster_soft", SEGMENTER, "raster_soft"),
     AFTER,
@@ -246,23 +247,31 @@ def draw(real: pd.DataFrame, path: Path) -> None:
     views = real[real["kind"].str.startswith("R1") & (real["radius_m"] == 250)]
     regions = list(dict.fromkeys(views["region"]))
     figure, panels = plt.subplots(1, len(regions), figsize=(2.2 * len(regions), 2.7), sharey=True, squeeze=False)
-    styles = ((PERFECT, "#999999", ":"), (AFTER, "#0072b2", "-"), (BEFORE, "#d55e00", "--"))
+    styles = (
+        (PERFECT, "#999999", ":", "o", 3),
+        (AFTER, "#0072b2", "-", "o", 5),
+        (BEFORE_SOFT, "#e69f00", "-.", "s", 3),
+        (BEFORE, "#d55e00", "--", "^", 3),
+    )
     for panel, region in zip(panels[0], regions, strict=True):
-        for way, colour, style in styles:
+        for way, colour, style, marker, size in styles:
             rows = of_way(views[views["region"] == region], way)
             means = rows.groupby("side_m")["hit"].mean()
-            panel.plot(means.index, 100 * means, style, color=colour, marker="o", markersize=3, label=way.title)
-        panel.set_title(
-            f"{region.removesuffix('-ortho')}\nn = {rows.groupby('side_m').size().min()} a point", fontsize=8
-        )
+            panel.plot(means.index, 100 * means, style, color=colour, marker=marker, markersize=size, label=way.title)
+        counts = sorted(rows.groupby("side_m").size())
+        numbers = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
+        panel.set_title(f"{region.removesuffix('-ortho')}\nn = {numbers} a point", fontsize=8)
         panel.set_xscale("log")
         panel.set_xticks(SIDES_M, [f"{side_m:g}" for side_m in SIDES_M], fontsize=7)
         panel.minorticks_off()
+        panel.set_xlim(0.9 * min(SIDES_M), 1.1 * max(SIDES_M))
         panel.set_ylim(-3, 103)
         panel.grid(alpha=0.3)
     panels[0][0].set_ylabel("found, %")
     figure.supxlabel("side of the view, m", fontsize=9)
-    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="upper center", ncols=3, fontsize=8, frameon=False)
+    figure.legend(
+        *panels[0][0].get_legend_handles_labels(), loc="upper center", ncols=len(styles), fontsize=8, frameon=False
+    )
     figure.tight_layout(rect=(0, 0, 1, 0.92))
     figure.savefig(path, metadata={"Date": None})
 

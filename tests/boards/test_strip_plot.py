@@ -47,7 +47,9 @@ def cases(rights, suites=None):
     rows = rows.assign(query_id=[f"q{at:02}" for at in range(len(rows))], region="town", suite=names, role="stress")
     rows = rows.assign(yaw_error_deg=0.0, detector="rendered")
     tasks = {
-        (name, "town"): SimpleNamespace(manifest=SimpleNamespace(frames=3 if "+" in name else None))
+        (name, "town"): SimpleNamespace(
+            manifest=SimpleNamespace(frames=3 if "+" in name else None, is_of_flights=False)
+        )
         for name in set(names)
     }
     return SimpleNamespace(scores=rows.assign(is_present=True), tasks=tasks, run="out/runs/good")

@@ -192,7 +192,7 @@ def _draw_row(line: Sequence[Axes], case: CasePicture, *, is_first: bool) -> Non
         chart.set_title(name if is_first else "", fontsize=9)
     line[4].set_xlabel(f"{across_m:.0f} m across", fontsize=8, labelpad=2)
     what = case.what.split(" (")[0].replace(", strength", "")  # without the unit, which has no room
-    line[0].set_xlabel(f"{case.region}: {what}", fontsize=8, labelpad=2)
+    line[0].set_xlabel(f"{case.region}: {what}", fontsize=8, labelpad=2, loc="left")
     verdict = "FOUND" if case.is_found else "MISSED"
     off = "no answer" if case.error_m is None else f"{case.error_m:.0f} m and {case.error_deg:.0f} deg off"
     colour = _FOUND if case.is_found else _MISSED

@@ -58,11 +58,11 @@ BEFORE_SOFT: Final = Way("before: raster_soft", "pixel_forest", "raster_soft")
 AFTER: Final = Way("after", SEGMENTER, "sasgeo")
 ADAPTED: Final = Way("by the map's shares", f"{SEGMENTER}{RECALIBRATED}", "sasgeo")
 WAYS: Final = (
+    AFTER,
     BEFORE,
     BEFORE_SOFT,
     Way("osm_unet: states", SEGMENTER, "sasgeo_hard"),
     Way("osm_unet: raster_soft", SEGMENTER, "raster_soft"),
-    AFTER,
     PERFECT,
 )
 
@@ -93,8 +93,9 @@ def interval(rows: pd.DataFrame) -> str:
 
 def by_place(real: pd.DataFrame) -> Iterator[str]:
     """Yield what is found of single views, by region, ground, size and disc."""
-    yield line("Region", "Ground", "View, m", "Disc, m", "n", *(way.title for way in WAYS), "after, 95 %")
-    yield line(*["---"] * 4, *["---:"] * (1 + len(WAYS)), "---")
+    first, *others = WAYS
+    yield line("Region", "Ground", "View, m", "Disc, m", "n", first.title, "95 %", *(way.title for way in others))
+    yield line(*["---"] * 2, *["---:"] * 4, "---", *["---:"] * len(others))
     views = real[real["kind"].str.startswith("R1")]
     for region in dict.fromkeys(views["region"]):
         for ground, kinds in (("built, mixed", TOWN), ("all", None)):
@@ -105,8 +106,9 @@ def by_place(real: pd.DataFrame) -> Iterator[str]:
                     after = of_way(rows, AFTER)
                     if after.empty:
                         continue
-                    found = [percent(of_way(rows, way)) for way in WAYS]
-                    yield line(region, ground, f"{side_m:g}", radius_m, len(after), *found, interval(after))
+                    shares = [percent(of_way(rows, way)) for way in others]
+                    labels = (region, ground, f"{side_m:g}", radius_m, len(after))
+                    yield line(*labels, percent(after), interval(after), *shares)
 
 
 def over_places(real: pd.DataFrame, regions: Sequence[str]) -> Iterator[str]:

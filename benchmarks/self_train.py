@@ -203,6 +203,7 @@ def main() -> None:
     parser.add_argument("--region", default="chateaugiron-ortho")
     parser.add_argument("--least", type=float, default=0.9, help="posterior of an accepted fix")
     parser.add_argument("--steps", type=int, default=1000, help="of 4 crops")
+    parser.add_argument("--seed", type=int, default=0, help="of the order of crops: another one tells luck")
     parser.add_argument("--rate", type=float, default=3e-4, help="of learning, at its highest")
     given = parser.parse_args()
     if not given.begin.is_file():
@@ -218,8 +219,8 @@ def main() -> None:
     print(row("before", areas_of(counts), len(counts)), flush=True)
     teachers = sources_of(DRAWN, REAL, 0.3, given.out)
     for way, sources in ways_of(views, given.least, teachers).items():
-        kept = folder / f"{given.region}-{way}-{given.steps}"
-        recipe = teach.Recipe(steps=given.steps, rate=given.rate, begin=given.begin, part=PART)
+        kept = folder / f"{given.region}-{way}-{given.steps}-{given.seed}"
+        recipe = teach.Recipe(steps=given.steps, rate=given.rate, begin=given.begin, part=PART, seed=given.seed)
         teach.export(teach.train(sources, kept.with_suffix(".pt"), recipe), kept.with_suffix(".onnx"))
         counts = list(counted(OsmUNet(kept.with_suffix(".onnx")), views_of(region, EAST)))
         print(row(way, areas_of(counts), len(counts)), flush=True)

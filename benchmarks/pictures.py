@@ -56,6 +56,7 @@ PERFECT: Final = Way("perfect masks", "oracle_segmenter", "sasgeo")
 BEFORE: Final = Way("before: states", "pixel_forest", "sasgeo_hard")
 BEFORE_SOFT: Final = Way("before: raster_soft", "pixel_forest", "raster_soft")
 AFTER: Final = Way("after", SEGMENTER, "sasgeo")
+SAME_READER: Final = Way("pixel_forest: sasgeo", "pixel_forest", "sasgeo")  # asked of drawn pictures alone
 ADAPTED: Final = Way("by the map's shares", f"{SEGMENTER}{RECALIBRATED}", "sasgeo")
 WAYS: Final = (
     AFTER,
@@ -166,7 +167,7 @@ def spoilt(scores: pd.DataFrame) -> Iterator[str]:
 
 def drawn(scores: pd.DataFrame) -> Iterator[str]:
     """Yield what is found of drawn pictures, by look and size of the view, with intervals by places."""
-    ways = [way for way in WAYS if way.segmenter != PERFECT.segmenter]
+    ways = [*(way for way in WAYS if way.segmenter != PERFECT.segmenter), SAME_READER]
     yield line("Look", "View, m", "n", "Places", *(f"{way.title} [95 %]" for way in ways))
     yield line("---", *["---:"] * 3, *["---"] * len(ways))
     aerial = scores[(scores["suite"] == "aerial") & (scores["role"] != "falsifier")]
@@ -291,7 +292,7 @@ def read_answers(folder: Path) -> pd.DataFrame:
     check_run(folder)
     frames = []
     for matcher in dict.fromkeys(way.matcher for way in WAYS):
-        asked = {way.segmenter for way in (*WAYS, ADAPTED) if way.matcher == matcher}
+        asked = {way.segmenter for way in (*WAYS, ADAPTED, SAME_READER) if way.matcher == matcher}
         suites = [f"{suite}+{segmenter}" for suite in SUITES for segmenter in asked]
         found = scored(folder, [matcher], [name for name in suites if (folder / "tasks" / name).is_dir()])
         frames += [frame.assign(matcher=name) for name, frame in found.with_calibration.items()]

@@ -15,7 +15,7 @@ alone, so that P(false fix) is fitted on Andorra's and read off at the test plac
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -188,7 +188,17 @@ def scored(out: Path, matchers: Sequence[str], suites: Sequence[str], rejectors:
     with TemporaryDirectory() as scratch:
         runs = [out / "runs" / name for name in matchers]
         request = request_of(runs, board=Path(scratch) / "board", root=out, split=SPLIT, rejectors=rejectors)
-        return score_board(replace(request, tasks=[task for name in suites for task in tasks_of(out, name)]))
+        found = score_board(replace(request, tasks=[task for name in suites for task in tasks_of(out, name)]))
+    check_names(found.with_calibration, matchers, out)
+    return found
+
+
+def check_names(names: Collection[str], matchers: Collection[str], out: Path) -> None:
+    """End with one line if a folder has answers of several versions of a matcher, which have names of their own."""
+    if others := sorted(set(names) - set(matchers)):
+        raise SystemExit(
+            f"{out / 'runs'} holds answers of {', '.join(others)}: move all but one version of each out of it"
+        )
 
 
 def tasks_of(out: Path, suite: str) -> list[Path]:

@@ -18,6 +18,7 @@ A way that was cut off goes on from its last part of steps.
 """
 
 import argparse
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from numpy.typing import NDArray
 from sasgeo_baselines.segmenters.osm_unet import OsmUNet, OsmUNetHeldOut
 
 import sasgeo_bench as sgb
+from benchmarks.faint_views import is_close
 from benchmarks.real_pictures import GSD_M, Area, areas_of, counted, part_of, views_of
 from benchmarks.real_pictures import SIDE_PX as VIEW_PX
 from benchmarks.segmenter_lessons import (
@@ -50,7 +52,6 @@ from sasgeo_bench.tasks.query import Query
 
 CELL_M: Final = 1.0
 RADIUS_M, YAW_SIGMA_DEG, SCALE_SIGMA = 250.0, 20.0, 0.03
-CLOSE_M, CLOSE_DEG = 25.0, 5.0
 WEST: Final[Box] = (0.0, 0.5, 0.0, 1.0)
 EAST: Final[Box] = (0.5, 1.0, 0.0, 1.0)
 SHOWN: Final = ("building", "road", "path_track", "water", "green", "farmland")
@@ -164,8 +165,6 @@ def answered(region: sgb.Region, box: Box, *, seed: int = 0) -> Iterator[Answere
         if not match.poses:
             continue
         pose = match.poses[0]
-        far_m = float(np.hypot(pose.easting_m - truth.easting_m, pose.northing_m - truth.northing_m))
-        turned_deg = abs((pose.yaw_deg + 180) % 360 - 180)
         yield Answered(
             rgb=view.image.rgb,
             classes=region.classes,
@@ -173,7 +172,7 @@ def answered(region: sgb.Region, box: Box, *, seed: int = 0) -> Iterator[Answere
             truth=observe(bits, region.grid, truth, size_cells=VIEW_PX, cell_size_m=GSD_M),
             pose=pose,
             chance=match.confidence or 0.0,
-            is_right=far_m <= CLOSE_M and turned_deg <= CLOSE_DEG,
+            is_right=is_close(pose, truth),
         )
 
 
@@ -187,6 +186,12 @@ def ways_of(views: Sequence[Answered], least: float, teachers: Sequence[Source])
         "all": [*before, Fixes(views=tuple(views), share=0.5)],
         "true": [*before, Fixes(views=tuple(views), share=0.5, is_true=True)],
     }
+
+
+def key_of(teachers: Sequence[Teacher], begin: Path, *numbers: float) -> str:
+    """Return what a kept state is known by: another state, number or answer must not go on from it."""
+    fixes = [(view.pose, view.chance, one.is_true) for one in teachers if isinstance(one, Fixes) for view in one.views]
+    return hashlib.sha256(begin.read_bytes() + repr((numbers, fixes)).encode()).hexdigest()[:12]
 
 
 def row(way: str, areas: dict[str, Area], count: int) -> str:
@@ -212,14 +217,17 @@ def main() -> None:
     region, folder = region_of(given.region, given.out), given.out / "segmenters" / "self_train"
     folder.mkdir(parents=True, exist_ok=True)
     views = list(answered(region, WEST))
-    for title, some in (("all", views), ("accepted", [view for view in views if view.chance >= given.least])):
+    accepted = [view for view in views if view.chance >= given.least]
+    if not accepted:
+        raise SystemExit(f"none of {len(views)} answers is as sure as {given.least:g}: give a smaller --least")
+    for title, some in (("all", views), ("accepted", accepted)):
         print(f"{title}: {len(some)} views, {sum(not view.is_right for view in some)} of them at a wrong place")
     print(f"\n| Way | n | {' | '.join(SHOWN)} |\n|---|{'---:|' * (1 + len(SHOWN))}", flush=True)
     counts = list(counted(OsmUNetHeldOut(), views_of(region, EAST)))
     print(row("before", areas_of(counts), len(counts)), flush=True)
     teachers = sources_of(DRAWN, REAL, 0.3, given.out)
     for way, sources in ways_of(views, given.least, teachers).items():
-        kept = folder / f"{given.region}-{way}-{given.steps}-{given.seed}"
+        kept = folder / f"{given.region}-{way}-{key_of(sources, given.begin, given.steps, given.rate, given.seed)}"
         recipe = teach.Recipe(steps=given.steps, rate=given.rate, begin=given.begin, part=PART, seed=given.seed)
         teach.export(teach.train(sources, kept.with_suffix(".pt"), recipe), kept.with_suffix(".onnx"))
         counts = list(counted(OsmUNet(kept.with_suffix(".onnx")), views_of(region, EAST)))

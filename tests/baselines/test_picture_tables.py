@@ -9,7 +9,18 @@ import pytest
 from sasgeo_baselines.segmenters.osm_unet import HELD_OUT_WEIGHTS, WEIGHTS
 
 import sasgeo_bench as sgb
-from benchmarks.pictures import ADAPTED, AFTER, BEFORE, PERFECT, adapted, by_place, chances, read_answers, spoilt
+from benchmarks.pictures import (
+    ADAPTED,
+    AFTER,
+    BEFORE,
+    PERFECT,
+    adapted,
+    by_place,
+    chances,
+    check_names,
+    read_answers,
+    spoilt,
+)
 from benchmarks.real_pictures import SCALES, Scaled, box_of, weights_of
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 
@@ -124,3 +135,9 @@ def test_what_is_no_part_of_a_picture_is_refused(text):
 def test_a_folder_without_answers_is_named_with_the_command_that_makes_them(tmp_path):
     with pytest.raises(SystemExit, match=r"holds no answers of `pictures`: sasgeo-bench leaderboard pictures --out "):
         read_answers(tmp_path)
+
+
+def test_answers_of_two_versions_are_not_taken_for_none(tmp_path):
+    check_names(["sasgeo"], ["sasgeo"], tmp_path)
+    with pytest.raises(SystemExit, match=r"runs holds answers of sasgeo 4, sasgeo 5: move all but one version"):
+        check_names(["sasgeo 4", "sasgeo 5"], ["sasgeo"], tmp_path)

@@ -8,7 +8,7 @@ from sasgeo_baselines.segmenters.osm_unet import CLASSES
 import sasgeo_bench as sgb
 from benchmarks import self_train
 from benchmarks.segmenter_lessons import SIDE_PX, Source, batches
-from benchmarks.self_train import Answered, Fixes, asked, evidence_of, placed, ways_of
+from benchmarks.self_train import Answered, Fixes, asked, evidence_of, key_of, placed, ways_of
 from sasgeo_bench.regions.evidence import PRESENT, LayerBits, observe
 from sasgeo_bench.regions.region_files import read_region
 from tests import world
@@ -72,6 +72,16 @@ def test_each_way_asks_its_teachers_once_in_all():
         "true": 3,
     }
     assert [ways[way][-1].is_true for way in ("accepted", "all", "true")] == [False, False, True]
+
+
+def test_a_kept_state_is_known_by_all_that_it_was_taught_by(tmp_path):
+    begin, other = tmp_path / "a.pt", tmp_path / "b.pt"
+    begin.write_bytes(b"a")
+    other.write_bytes(b"b")
+    fixes = [Fixes(views=(answered(chance),), share=0.5) for chance in (0.9, 0.9, 0.8)]
+    keys = [key_of([one], begin, 500, 1e-3) for one in fixes]
+    assert keys[0] == keys[1]
+    assert len({*keys, key_of(fixes[:1], other, 500, 1e-3), key_of(fixes[:1], begin, 500, 1e-4)}) == 4
 
 
 def test_the_prior_is_off_by_as_much_as_it_says(hamlet):

@@ -16,6 +16,7 @@ from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_pro
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import plain
 from sasgeo_bench.observing.locate import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
@@ -127,7 +128,7 @@ def line_of(fix: Fix) -> str:
         words.append(f"P(false fix) {fix.p_false:.3f}")
     if fix.file_distance_m is not None:
         words.append(f"{fix.file_distance_m:.0f} m from the file's position")
-    text = f"{fix.file}: {', '.join(words)}"
+    text = f"{plain(fix.file)}: {', '.join(words)}"
     return f"{text}: {fix.reason}" if fix.reason else text
 
 

@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -21,7 +20,6 @@ from sasgeo_bench.observing.locate import MATCHER, MOST_FALSE, RADIUS_M, SEGMENT
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results
-from sasgeo_bench.regions.region_files import read_region
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
 _PAIR: Final = re.compile(r"\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*,\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*")
@@ -105,12 +103,12 @@ def locate(options: LocateOptions) -> Located:
         most_false=options.most_false,
         is_sandboxed=not options.trusted,
     )
-    found = located_by(request, lambda region: Strips(into, partial(read_region, region)))
+    found = located_by(request, lambda region: Strips(into, region))
     for fix in found.fixes:
         options.say(line_of(fix))
     for note in (found.calibration, *notes_of(found.fixes)):
         tell(note)
-    write_results(found, read_region(found.region))
+    write_results(found)
     return found
 
 

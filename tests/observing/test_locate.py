@@ -274,9 +274,9 @@ def test_a_trajectory_has_the_heading_as_scipy_reads_it():
     assert ahead == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)  # a heading of 90 degrees is east
 
 
-def test_names_of_files_are_text_on_the_page(located, towns):
+def test_names_of_files_are_text_on_the_page(located):
     found = replace(located[1], fixes=FIXES)
-    page = page_text(found, sgb.read_region(towns / "regions" / TOWN))
+    page = page_text(found)
     assert "<b>&.jpg" not in page
     assert "&lt;b&gt;&amp;.jpg" in page
 

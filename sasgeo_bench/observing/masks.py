@@ -50,7 +50,7 @@ class Legend(Document):
     a list of classes, one of which it is; of values and colours also "none" and "unknown". Whatever is not named is
     unknown. A class of the taxonomy that the legend does not name is unknown everywhere.
 
-    >>> text = '[values]\\n0 = "none"\\n1 = "building"\\n2 = ["road_major", "road_minor"]'
+    >>> text = '[values]\n0 = "none"\n1 = "building"\n2 = ["road_major", "road_minor"]'
     >>> parse_toml(text, Legend, source="legend.toml").classes
     ('road_major', 'road_minor', 'building')
     """
@@ -170,7 +170,7 @@ def read_mask(path: Path, legend: Legend, strange: Strange | None = None) -> Seg
     Examples
     --------
     >>> import tempfile
-    >>> legend = parse_toml('[values]\\n0 = "none"\\n1 = "water"', Legend, source="legend.toml")
+    >>> legend = parse_toml('[values]\n0 = "none"\n1 = "water"', Legend, source="legend.toml")
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     np.save(Path(folder, "mask.npy"), np.array([[0, 1, 1, 9]], dtype=np.uint8))
     ...     read_mask(Path(folder, "mask.npy"), legend).probability_bytes.tolist()

@@ -120,9 +120,10 @@ def imagery_folders(given: Sequence[Path] = (), *, extracts: Sequence[Path] = ()
     return (*given, *named, *(folder.parent / "imagery" for folder in extract_folders(extracts)[:-1]))
 
 
-def named_files(name: str, folders: Sequence[Path]) -> list[Path]:
-    """List the files of a name in folders and in the folders directly below them, in order."""
-    return [path for folder in folders for path in (folder / name, *sorted(folder.glob(f"*/{name}"))) if path.is_file()]
+def named_files(name: str, folders: Sequence[Path], *, has_folders: bool = False) -> list[Path]:
+    """List the files of a name in folders and in the folders directly below them, in order; folders of it, too."""
+    found = (path for folder in folders for path in (folder / name, *sorted(folder.glob(f"*/{name}"))))
+    return [path for path in found if path.is_file() or (has_folders and path.is_dir())]
 
 
 def cache_folder() -> Path:

@@ -17,7 +17,6 @@ from sasgeo_bench.core.folders import FileRecord, file_record
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, PlainName, Sha256, imagery_folders, named_files
-from sasgeo_bench.regions.tiles import record_of
 
 ORTHO: Final = "ortho.tif"
 MOST_WINDOW_PIXELS: Final = 64_000_000  # 256 MB as colours and mask
@@ -311,6 +310,8 @@ def find_imagery(entry: ImageryEntry, *, folders: Sequence[Path] = (), extracts:
 
     Pictures are never downloaded. Raise `ImageryError` if no folder holds it; the message says where to put it.
     """
+    from sasgeo_bench.regions.tiles import record_of  # noqa: PLC0415 - GDAL is slow to import
+
     places = imagery_folders(folders, extracts=extracts)
     wrong: list[str] = []
     for path in named_files(entry.file, places, has_folders=True):

@@ -9,16 +9,18 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
+
+import rasterio
+from PIL import Image, UnidentifiedImageError
+from rasterio.errors import NotGeoreferencedWarning
+from rasterio.io import DatasetReader, MemoryFile
 
 from sasgeo_bench.core.errors import ImageryError, counted
 from sasgeo_bench.core.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.projection import between, to_lonlat
-
-if TYPE_CHECKING:
-    from rasterio.io import DatasetReader
 
 MERCATOR: Final = 3857
 MOST_TILES: Final = 40_000  # of one zoom that lie in a region
@@ -59,14 +61,11 @@ def is_database(path: Path) -> bool:
 
 
 @contextmanager
-def open_database(path: Path, layer: str | None) -> Iterator["DatasetReader"]:
+def open_database(path: Path, layer: str | None) -> Iterator[DatasetReader]:
     """Open an MBTiles, or the one raster of a GeoPackage, or that of a name; rows from the south are turned by GDAL.
 
     Raise `ImageryError` if it has no such raster, or several and none is named.
     """
-    import rasterio  # noqa: PLC0415 - GDAL is slow to import
-    from rasterio.errors import NotGeoreferencedWarning  # noqa: PLC0415
-
     with path.open("rb") as file:
         driver = "GPKG" if file.read(100)[_APPLICATION] == b"GPK" else "MBTiles"
     if driver == "MBTiles" and layer is not None:
@@ -85,14 +84,12 @@ def open_database(path: Path, layer: str | None) -> Iterator["DatasetReader"]:
 
 
 @contextmanager
-def open_tiles(folder: Path, grid: Grid, *, tms: bool, gsd_m: float | None) -> Iterator["DatasetReader"]:
+def open_tiles(folder: Path, grid: Grid, *, tms: bool, gsd_m: float | None) -> Iterator[DatasetReader]:
     """Open the tiles of a folder `zoom/column/row.png` that meet a grid, as one picture in Web Mercator.
 
     The deepest zoom is read, or the coarsest one that is not coarser than `gsd_m`. Rows count from the north, or with
     `tms` from the south. Raise `ImageryError` if no tile meets the grid, or one is no picture of red, green and blue.
     """
-    from rasterio.io import MemoryFile  # noqa: PLC0415 - GDAL is slow to import
-
     tiles = list(_tiles(folder, tms=tms))
     if not tiles:
         raise ImageryError(f"{folder} holds no tiles zoom/column/row.png (or .jpg, .webp): is it the right folder?")
@@ -169,8 +166,6 @@ def _mosaic(tiles: list[_Tile]) -> bytes:
 
 def _checked_size(tiles: list[_Tile]) -> int:
     """Return the side of the tiles, pixels, after a look at the head of each: GDAL would open what it names."""
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415 - few regions have tiles
-
     sizes = set()
     for tile in tiles:
         try:

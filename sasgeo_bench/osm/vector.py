@@ -131,31 +131,35 @@ def scan_vector(path: Path, taxonomy: Taxonomy, table: ClassTable, *, grid: Grid
     """
     source = _open(path, table)
     step, doubt = _step(path, source.crs, grid)
-    rows = _read(source, table, _box_in(path, step, grid))
-    scan = Scan()
-    if any(shape is None for shape in rows.shapes):
-        scan.tally.drops["feature without a geometry"] += sum(shape is None for shape in rows.shapes)
-    shapes_m = shapely.transform(rows.shapes, lambda at: np.column_stack(step.transform(*at.T)))
-    bounds = shapely.bounds(shapes_m)
-    west, south, east, north = grid.bounds_m
-    near = (bounds[:, 0] <= east) & (bounds[:, 2] >= west) & (bounds[:, 1] <= north) & (bounds[:, 3] >= south)
-    if lost := int((np.isinf(bounds).any(axis=1)).sum()):
-        scan.tally.drops["feature that cannot be projected to the region"] += lost
-    near &= np.isfinite(bounds).all(axis=1)
-    if not near.any():
-        raise CoverageError(_nothing(path, source.crs, rows.bounds, step, grid))
-    at = np.flatnonzero(near)
-    shapes, mended = _mended(path, shapes_m[at])
-    found = list(_found(scan, shapes, [rows.values[i] for i in at], [rows.widths[i] for i in at], table, taxonomy))
+    box = _box_in(path, step, grid)
+    rows, scan = _read(source, table, box), Scan()
+    bounds = shapely.bounds(rows.shapes)
+    if lost := int((~np.isfinite(bounds).all(axis=1)).sum()):
+        scan.tally.drops["feature without a geometry"] += lost
+    near = np.flatnonzero(_meets(bounds, box))
+    shapes_m = shapely.transform(rows.shapes[near], lambda at: np.column_stack(step.transform(*at.T)))
+    is_in = _meets(shapely.bounds(shapes_m), grid.bounds_m)
+    if not is_in.any():
+        raise CoverageError(_nothing(path, source.crs, rows.bounds, box))
+    shapes, mended = _mended(path, shapes_m[is_in])
+    values = [rows.values[at] for at in near[is_in]]
+    found = list(_found(scan, shapes, values, [rows.widths[at] for at in near[is_in]], table, taxonomy))
     reasons = ", ".join(f"{count} x {reason}" for reason, count in scan.tally.drops.most_common(_MOST_NAMED))
     if not found:
-        raise ExtractError(f"{path}: none of {counted(len(at), 'feature')} in the region has a class ({reasons})")
-    left = len(at) - len(found)
-    partial = f"{path.name}: {left} of {counted(len(at), 'feature')} in the region have no class ({reasons})"
-    missed = sorted(set(table.values) - {rows.values[i] for i in at})
-    unused = f"{path.name}: no feature in the region has the {named(missed, 'value')} of `values`" if missed else ""
+        raise ExtractError(f"{path}: none of {counted(len(shapes), 'feature')} in the region has a class ({reasons})")
     _number(scan, found, taxonomy, grid)
-    return VectorScan(scan, tuple(filter(None, (doubt, mended, partial if left else "", unused))))
+    left, unused = len(shapes) - len(found), sorted(set(table.values) - set(values))
+    partial = f"{path.name}: {left} of {counted(len(shapes), 'feature')} in the region have no class ({reasons})"
+    missed = f"{path.name}: no feature in the region has the {named(unused, 'value')} of `values`"
+    said = ((doubt, doubt), (mended, mended), (left, partial), (unused, missed))
+    return VectorScan(scan, tuple(text for is_so, text in said if is_so))
+
+
+def _meets(bounds: Points, box: Box) -> NDArray[np.bool_]:
+    """Return which of some bounds, shape (N, 4), are finite and meet a box."""
+    west, south, east, north = box
+    meets = (bounds[:, 0] <= east) & (bounds[:, 2] >= west) & (bounds[:, 1] <= north) & (bounds[:, 3] >= south)
+    return np.asarray(meets & np.isfinite(bounds).all(axis=1))
 
 
 class _Source(NamedTuple):
@@ -342,10 +346,10 @@ def _read(source: _Source, table: ClassTable, box: Box) -> _Rows:
 
 
 def _read_geojson(path: Path, table: ClassTable) -> _Rows:
-    shapes, values, widths, keys = [], list[str](), list[str](), Counter[str]()
+    shapes, values, widths, keys = [], list[str](), list[str](), dict[str, None]()
     for number, feature in enumerate(features_of(path, epsg=table.epsg)):
         properties = feature.get("properties") or {}
-        keys.update(properties)
+        keys |= dict.fromkeys(properties)
         shapes.append(shape_of(feature, path, number, is_lonlat=table.epsg is None))
         values.append(_text(properties.get(table.column)))
         widths.append(_text(properties.get(table.width_column)))
@@ -439,17 +443,18 @@ def _text(value: object) -> str:
     return str(int(value) if isinstance(value, float) and value.is_integer() else value).strip()
 
 
-def _nothing(path: Path, crs: pyproj.CRS, bounds: Sequence[float], step: pyproj.Transformer, grid: Grid) -> str:
+def _nothing(path: Path, crs: pyproj.CRS, bounds: Sequence[float], box: Box) -> str:
     """Say that a file holds nothing in a region, where it lies, and whether its axes are swapped."""
-    west, south, east, north = _box_in(path, step, grid)
+    west, south, east, north = box
     code = crs.to_epsg()
-    where = ", ".join(f"{value:.6g}" if crs.is_geographic else f"{value:.0f}" for value in bounds)
+    digits = ".4f" if crs.is_geographic else ".0f"
+    where, wanted = (", ".join(f"{value:{digits}}" for value in one) for one in (bounds, box))
     text = f"{path.name} holds nothing in the region: it lies within [{where}] of "
     text += f"EPSG:{code}" if code else one_line(crs.name)[:60]
     low_y, low_x, high_y, high_x = bounds
     if low_x <= east and high_x >= west and low_y <= north and high_y >= south:
         return f"{text}, and in the region with its axes swapped: write x, or longitude, first"
-    return f"{text}, the region within [{west:.6g}, {south:.6g}, {east:.6g}, {north:.6g}]: is its epsg right?"
+    return f"{text}, the region within [{wanted}]: is its epsg right?"
 
 
 def _mended(path: Path, shapes_m: Geometries) -> tuple[Geometries, str]:

@@ -21,6 +21,7 @@ from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError, CoverageError, ExtractError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm import vector
+from sasgeo_bench.osm.locate import imagery_folders, named_files
 from sasgeo_bench.osm.read import read_vector
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.osm.vector import ClassTable
@@ -458,3 +459,22 @@ def test_a_table_that_says_no_classes_is_refused(text, fault):
         table(text)
     assert fault in str(found.value)
     assert "\n" not in str(found.value)
+
+
+@pytest.mark.real
+def test_real_labels_in_web_mercator_lie_where_their_numbers_say():
+    name = "OAM-393753-226409-19.geojson"
+    path = next(iter(named_files(name, imagery_folders())), None)
+    if path is None:
+        pytest.skip(f"{name} is on no folder of imagery")
+    shapes = [shapely.geometry.shape(one["geometry"]) for one in json.loads(path.read_text())["features"]]
+    west, south, east, north = shapely.total_bounds(shapes)
+    to_utm = pyproj.Transformer.from_crs(3857, 32645, always_xy=True)
+    grid = Grid.from_bounds(*to_utm.transform_bounds(west, south, east, north), cell_size_m=0.5, epsg=32645)
+    found = read(path, 'class = "building"\nepsg = 3857', grid=grid, stated=shapely.box(90, 23, 91, 24)).features
+    assert len(found) == len(shapes) == 274
+    moved = [shapely.transform(one, lambda at: np.column_stack(to_utm.transform(*at.T))) for one in shapes]
+    assert sorted(found.area) == pytest.approx(sorted(one.area for one in moved), abs=0.05)
+    assert shapely.hausdorff_distance(shapely.union_all(found.geometry.to_numpy()), shapely.union_all(moved)) < 0.01
+    # 23.8 degrees north: metres of Web Mercator are longer than those on the ground by 1 / cos
+    assert found.area.sum() == pytest.approx(sum(one.area for one in shapes) * np.cos(np.radians(23.8)) ** 2, rel=0.01)

@@ -21,12 +21,12 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from sasgeo_bench.core.errors import GridError, ImageryError
-from sasgeo_bench.core.geotiff import open_geotiff
+from sasgeo_bench.core.geotiff import is_database, open_geotiff
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.imagery import BANDS, ImageryEntry, PictureRecord
 from sasgeo_bench.regions.layers import RGB, Bands, find_bands, selected
-from sasgeo_bench.regions.tiles import is_database, open_database, open_tiles, record_of
+from sasgeo_bench.regions.tiles import open_tiled, open_tiles, record_of
 
 MOST_PIXELS: Final = 4_000_000_000  # of a picture
 MOST_ORTHO_PIXELS: Final = 2_000_000_000  # of what is cut out of all; what holds no picture counts too
@@ -119,7 +119,7 @@ def _source(path: Path, entry: ImageryEntry, grid: Grid) -> AbstractContextManag
     if path.is_dir():
         return open_tiles(path, grid, tms=entry.tms, gsd_m=entry.gsd_m)
     if is_database(path):
-        return open_database(path, entry.layer)
+        return open_tiled(path, entry.layer)
     if entry.layer is not None or entry.tms:
         raise ImageryError(f"{path} is no GeoPackage of rasters or folder of tiles: leave layer and tms out")
     return open_geotiff(path, has_more=True)

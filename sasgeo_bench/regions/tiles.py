@@ -4,20 +4,18 @@
 import hashlib
 import math
 import re
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import rasterio
 from PIL import Image, UnidentifiedImageError
-from rasterio.errors import NotGeoreferencedWarning
 from rasterio.io import DatasetReader, MemoryFile
 
 from sasgeo_bench.core.errors import ImageryError, counted
 from sasgeo_bench.core.folders import FileRecord, file_record, sha256_of
+from sasgeo_bench.core.geotiff import is_geopackage, open_database
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.projection import between, to_lonlat
@@ -27,8 +25,6 @@ MOST_TILES: Final = 40_000  # of one zoom that lie in a region
 _HALF_M: Final = math.pi * 6_378_137.0  # of the equator in Web Mercator: tiles divide twice that
 _TILE: Final = re.compile(r"([0-9]{1,2})/([0-9]{1,8})/([0-9]{1,8})\.(png|jpg|jpeg|webp)")
 _SIZES: Final = (256, 512)
-_SQLITE: Final = b"SQLite format 3\0"
-_APPLICATION: Final = slice(68, 71)  # bytes in which an SQLite file says whose it is
 
 
 class _Tile(NamedTuple):
@@ -54,27 +50,15 @@ def record_of(path: Path) -> FileRecord:
     return FileRecord(sha256=hashlib.sha256(lines.encode()).hexdigest(), bytes=size)
 
 
-def is_database(path: Path) -> bool:
-    """Return whether a file is an SQLite database, as MBTiles and GeoPackages are."""
-    with plain_file(path).open("rb") as file:
-        return file.read(len(_SQLITE)) == _SQLITE
-
-
 @contextmanager
-def open_database(path: Path, layer: str | None) -> Iterator[DatasetReader]:
+def open_tiled(path: Path, layer: str | None) -> Iterator[DatasetReader]:
     """Open an MBTiles, or the one raster of a GeoPackage, or that of a name; rows from the south are turned by GDAL.
 
-    Raise `ImageryError` if it has no such raster, or several and none is named.
+    Raise `ImageryError` if there are several rasters and none is named.
     """
-    with path.open("rb") as file:
-        driver = "GPKG" if file.read(100)[_APPLICATION] == b"GPK" else "MBTiles"
-    if driver == "MBTiles" and layer is not None:
+    if layer is not None and not is_geopackage(path):
         raise ImageryError(f"{path} is an MBTiles, which has no layers: leave layer = {layer!r} out of its [[imagery]]")
-    table = {} if layer is None else {"TABLE": layer}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)  # refused by the next lines, or by what reads it
-        found = rasterio.open(path, driver=driver, **table)
-    with found as source:
+    with open_database(path, layer) as source:
         if source.count == 0:
             names = [name.rpartition(":")[2] for name in source.subdatasets]
             raise ImageryError(

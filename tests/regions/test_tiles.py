@@ -18,6 +18,7 @@ from PIL import Image
 from rasterio.warp import Resampling, reproject
 
 from sasgeo_bench.core.errors import ImageryError
+from sasgeo_bench.core.geotiff import open_database
 from sasgeo_bench.regions import tiles
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import read_manifest
@@ -228,3 +229,14 @@ def test_a_coarser_zoom_is_read_where_it_is_fine_enough(hamlet, tmp_path):
 )
 def test_a_raster_that_is_not_there_is_refused(picture, extra, fault, hamlet, tmp_path):
     assert fault in refusal(hamlet, tmp_path, picture, extra)
+
+
+@pytest.mark.parametrize("name", ["a.mbtiles", "a.gpkg"])
+def test_what_lies_beside_a_database_is_passed_over(name, hamlet, tmp_path):
+    path = shutil.copy(hamlet.folder / name, tmp_path)
+    domain = f'<Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">{tmp_path}/secret.tif</MDI></Metadata>'
+    path.with_name(f"{name}.aux.xml").write_text(f"<PAMDataset>{domain}</PAMDataset>")
+    with rasterio.open(path, driver="GPKG" if name == "a.gpkg" else "MBTiles") as source:
+        assert len(source.files) == 2  # GDAL itself reads it
+    with open_database(path) as source:
+        assert source.files == [str(path)]

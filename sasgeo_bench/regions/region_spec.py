@@ -104,8 +104,12 @@ class OwnMap(ClassTable):
     def _says_classes_once_or_tags(self) -> Self:
         if self.named_classes and (self.tags or tuple(self.classes) != self.named_classes):
             raise ValueError("classes and tags are of a GeoJSON of tags: leave them out beside class or column")
-        if not self.classes:
-            raise ValueError("say what its features are: class = '...', or column and values; or classes, if of tags")
+        is_json = self.file.lower().endswith((".geojson", ".json"))
+        if not self.classes or not (self.named_classes or is_json):
+            raise ValueError(
+                f"say what the features of {self.file!r} are: class = '...', or column and values; a GeoJSON of tags "
+                "has classes instead"
+            )
         return self
 
     @property

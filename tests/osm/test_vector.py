@@ -12,6 +12,7 @@ from pathlib import Path
 import geopandas as gpd
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pyproj
 import pytest
 import shapely
@@ -96,6 +97,21 @@ def test_every_format_gives_the_same_features_in_the_same_order(name, tmp_path):
     assert found["osm_id"].tolist() == [-5, -4, -3, -2, -1]  # none of OpenStreetMap, which are positive
     assert found["width_m"].tolist()[0] == 3.5
     assert found["width_m"].isna().tolist() == [False, True, True, True, True]
+
+
+def test_a_parquet_of_arrow_geometries_is_read(tmp_path):
+    path = saved(tmp_path / "a.parquet", frame(HOUSE, COURT), geometry_encoding="geoarrow")
+    found = read(path).features
+    assert [shape.area for shape in found.geometry] == pytest.approx([200, 1000], abs=0.1)
+
+
+def test_a_parquet_that_says_nothing_of_its_crs_is_longitude_and_latitude(tmp_path):
+    written = pq.read_table(saved(tmp_path / "a.parquet", frame(HOUSE).to_crs(4326)))
+    about = json.loads(written.schema.metadata[b"geo"])
+    del about["columns"]["geometry"]["crs"]
+    pq.write_table(written.replace_schema_metadata({"geo": json.dumps(about)}), tmp_path / "b.parquet")
+    (found,) = read(tmp_path / "b.parquet").features.geometry
+    assert shapely.hausdorff_distance(found, HOUSE) < 0.01
 
 
 def test_a_zipped_shapefile_has_one_kind_of_geometry_and_is_read_by_its_prj(tmp_path):

@@ -157,6 +157,7 @@ def test_a_map_that_must_not_be_passed_on_is_refused(folder, tmp_path):
         (['["building"]'], {"has_ring": False}, "say where they and the extract are complete by coverage_lonlat"),
         (['["building"]'], {"classes": '["building"]'}, "gives every class: leave one to"),
         (['["bulding"]'], {}, "classes has 'bulding', which is no class"),
+        (["[]"], {}, "say what the features of 'survey.geojson' are: class"),
     ],
 )
 def test_what_it_cannot_be_is_refused_in_a_line(own, changes, fault, folder):
@@ -180,6 +181,7 @@ publish = true
 house = "building"
 pond = "water"
 """
+OWN_EXTRACT = f'[[extract]]\nfile = "a"\ndate = 2024-01-01\nformat = "own_map"\nsha256 = ["{"0" * 64}"]\n'
 POND = shapely.box(WEST + 200, SOUTH + 205, WEST + 240, SOUTH + 235)
 
 
@@ -257,6 +259,12 @@ def test_alone_it_is_the_map_with_its_own_date_licence_and_credit(alone):
         ("column", 'class = "water"\ncolumn', "say which class its features are by class"),
         ("column", 'tags = { building = "yes" }\ncolumn', "classes and tags are of a GeoJSON of tags"),
         ('column = "use"\n', "", "say which class its features are by class"),
+        (
+            "[[own_map]]",
+            '[[extract]]\nfile = "a"\ndate = 2024-01-01\n[[own_map]]',
+            "needs either sha256 = [...] or town",
+        ),
+        ("[[own_map]]", f"{OWN_EXTRACT}[[own_map]]", "format 'own_map' is of no [[extract]]"),
     ],
 )
 def test_a_region_of_it_alone_that_cannot_be_is_refused_in_a_line(old, new, fault, tmp_path):

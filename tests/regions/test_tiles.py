@@ -233,7 +233,7 @@ def test_a_raster_that_is_not_there_is_refused(picture, extra, fault, hamlet, tm
 
 @pytest.mark.parametrize("name", ["a.mbtiles", "a.gpkg"])
 def test_what_lies_beside_a_database_is_passed_over(name, hamlet, tmp_path):
-    path = shutil.copy(hamlet.folder / name, tmp_path)
+    path = Path(shutil.copy(hamlet.folder / name, tmp_path))
     domain = f'<Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">{tmp_path}/secret.tif</MDI></Metadata>'
     path.with_name(f"{name}.aux.xml").write_text(f"<PAMDataset>{domain}</PAMDataset>")
     with rasterio.open(path, driver="GPKG" if name == "a.gpkg" else "MBTiles") as source:

@@ -3,6 +3,7 @@
 
 from .boards.board import StoredBoard as StoredBoard
 from .boards.board import read_board as read_board
+from .boards.cases import plot_evidence as plot_evidence
 from .boards.cases import plot_query as plot_query
 from .cli.boards import score as score
 from .cli.observing import locate as locate

@@ -73,6 +73,7 @@ OTHERS = {
     r"^pip install -e my-(matcher|segmenter|tracker|suite|metric|stress)$": "by hand: it needs the package registry",
     r"^python -c .import pandas; print": "reads stored results of the checkout, which a desk of tests lacks",
     r"^(sha256sum |install -m 600 |source \.venv/bin/activate$)": "programs of the system, and of the shell",
+    r"^'?\(cd'? my-tiles ": "programs of the system; tests/regions/test_tiles.py holds what they print",
     r"^podman ": "downloads and builds an image; tests/test_repository.py reads what it is built by",
     r"^bash findings/": "installs packages from the registry",
     r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",

@@ -8,6 +8,7 @@ from .cli.boards import score as score
 from .cli.publishing import publish as publish
 from .cli.queries import make_tasks as make_tasks
 from .cli.regions import build_region as build_region
+from .cli.regions import new_region as new_region
 from .cli.regions import propose_regions as propose_regions
 from .cli.regions import render_imagery as render_imagery
 from .cli.runs import run as run

@@ -32,19 +32,19 @@ _PARTIAL: Final = 206  # status of an answer that begins where it was asked to
 
 
 class RegionalExtract(Document):
-    """A regional extract by its name at the provider; the box (west, south, east, north, degrees) is rounded outwards.
-
-    >>> RegionalExtract(name="europe/andorra", box=(1.3, 42.4, 1.8, 42.7)).url
-    'https://download.geofabrik.de/europe/andorra-latest.osm.pbf'
-    """
+    """A regional extract by its name at the provider; the box (west, south, east, north, degrees) is rounded outwards."""
 
     name: Line
     box: Annotated[tuple[float, float, float, float], Field(strict=False)]
 
-    @property
-    def url(self) -> str:
-        """Return the address of the file."""
-        return f"{SERVER}/{self.name}-latest.osm.pbf"
+
+def address_of(name: str) -> str:
+    """Return the address of the newest file of a regional extract.
+
+    >>> address_of("europe/andorra")
+    'https://download.geofabrik.de/europe/andorra-latest.osm.pbf'
+    """
+    return f"{SERVER}/{name}-latest.osm.pbf"
 
 
 class _RegionalExtracts(Document):
@@ -86,7 +86,7 @@ def download_regional(area_lonlat: shapely.Geometry, *, most_mb: float) -> tuple
         raise ExtractError(f"no regional extract of {SERVER} holds the place whole: make it smaller")
     folder = cache_folder()
     with locked(folder / found.name.replace("/", "-")):
-        loaded = _load(found.url, folder, most_mb=most_mb)
+        loaded = _load(address_of(found.name), folder, most_mb=most_mb)
         header = read_header(loaded)
         day = header.replicated_at.date().isoformat() if header.replicated_at else "undated"
         return loaded.replace(folder / f"{found.name.rpartition('/')[2]}-{day}.osm.pbf"), found

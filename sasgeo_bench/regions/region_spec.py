@@ -2,8 +2,9 @@
 """RegionFile: the definition of a place in `regions/*.toml`."""
 
 import datetime as dt
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Final, Literal, Self
 
@@ -381,3 +382,32 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
     """
     return find_document(id_or_path, "region", "list regions shows all", lambda: list_region_files(folders=folders))
+
+
+def region_text(
+    fields: Mapping[str, object], *, provenance: Mapping[str, str | None], extracts: Sequence[Extract]
+) -> str:
+    """Return the text of a region file: its keys in their order, lines of provenance that are known, and extracts.
+
+    >>> extract = Extract(file="mine.osm.pbf", date=dt.date(2024, 1, 1), sha256=("0" * 64,))
+    >>> print(region_text({"id": "mine", "size_m": [512, 512]}, provenance={"country": None}, extracts=[extract])[:79])
+    # Extract (c) OpenStreetMap contributors, ODbL 1.0.
+    id = "mine"
+    size_m = [512, 512]
+    """
+    stated = {name: text for name, text in provenance.items() if text}
+    lines = [
+        "# Extract (c) OpenStreetMap contributors, ODbL 1.0.",
+        *(f"{key} = {_toml(fields[key])}" for key in fields),
+    ]
+    lines += ["", "[provenance]", *(f"{name} = {_toml(text)}" for name, text in stated.items())] if stated else []
+    for extract in extracts:
+        hashes = "".join(f"  {_toml(each)},\n" for each in extract.sha256)
+        lines += ["", "[[extract]]", f"file = {_toml(extract.file)}", f"date = {extract.date.isoformat()}"]
+        lines += [f"sha256 = [\n{hashes}]", *([f"urls = [{_toml(extract.urls[0])}]"] if extract.urls else [])]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    """Return a text, a number, or a list of them, as TOML writes it: here as JSON does."""
+    return json.dumps(value, ensure_ascii=False)

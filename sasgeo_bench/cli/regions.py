@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, named
+from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, counted, named
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
@@ -246,19 +246,21 @@ def _taken_at(folder: Path) -> NDArray[np.float64]:
     paths = sorted(path for path in folder.iterdir() if path.name.lower().endswith(PHOTOS))
     if not paths:
         raise ConfigError(f"{folder} holds no photo ({', '.join(PHOTOS)}): name the folder that they lie in")
-    lonlat, without = [], []
+    lonlat, without, broken = [], [], []
     for path in paths:
         try:
             photo = read_photo(path)
         except ImageError as error:
-            tell(f"passed over: {error}")
+            broken.append(error)
             continue
         if photo.lon_deg is None or photo.lat_deg is None:
             without.append(path.name)
         else:
             lonlat.append((photo.lon_deg, photo.lat_deg))
+    if broken:
+        tell(f"{counted(len(broken), 'photo')} of {len(paths)} cannot be read: {broken[0]}")
     if without:
-        tell(f"no position in {named(without, 'photo')} of {len(paths)}")
+        tell(f"{named(without, 'photo')} of {len(paths)} without a position")
     return np.array(lonlat, dtype=np.float64).reshape(-1, 2)
 
 

@@ -70,6 +70,7 @@ def _meets(bounds: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
 
 def _header(snapshot: Snapshot, box: Box) -> osmium.io.Header:
     header = osmium.io.Header()
+    header.set("sorting", "Type_then_ID")
     for stated in snapshot.boxes_lonlat or (box,):
         within = shapely.intersection(shapely.box(*stated), shapely.box(*box))
         if within.area:

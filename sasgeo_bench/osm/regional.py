@@ -32,7 +32,7 @@ _PARTIAL: Final = 206  # status of an answer that begins where it was asked to
 
 
 class RegionalExtract(Document):
-    """A regional extract by its name at the provider; the box (west, south, east, north, degrees) is rounded outwards."""
+    """A regional extract by its name at the provider; the box (west, south, east, north, degrees) is rounded up."""
 
     name: Line
     box: Annotated[tuple[float, float, float, float], Field(strict=False)]

@@ -99,7 +99,7 @@ class Place:
         Raise `ConfigError` if there is no point, or some lie more than `APART_M` from all others.
 
         >>> Place.of_points(np.array([[9.52, 47.15], [9.53, 47.15]])).size_m
-        (1759.0, 1001.0)
+        (1759.0, 1006.0)
         """
         if not len(lonlat):
             raise ConfigError("no photo says where it was taken: name the place by --center or --bounds")
@@ -214,25 +214,25 @@ def list_at_hand(folders: Sequence[Path], *, days: Days | None = None) -> list[A
 def find_covering(grid: Grid, extracts: Sequence[AtHand]) -> Covering | None:
     """Return the first extract that maps the whole of a grid, else the one that maps most of it, with a line, or None.
 
-    An extract is read only if its bounds meet the grid, and none of the same bounds was read before it.
+    An extract is read only if its bounds meet the grid, and none of the same bounds was before it.
     """
     area = shapely.box(*lonlat_box(grid))
     best: Covering | None = None
-    read: set[tuple[Box, ...]] = set()
+    outlines: set[tuple[Box, ...]] = set()
     for item in extracts:
         try:
             outline = tuple((round(w, 2), round(s, 2), round(e, 2), round(n, 2)) for w, s, e, n in item.boxes)
             bounds = shapely.union_all([shapely.box(*box) for box in item.boxes])
             most = bounds.intersection(area).area / area.area
-            if outline in read or most <= (best.share if best else 0.0):
+            if outline in outlines or most <= (best.share if best else 0.0):
                 continue
-            read.add(outline)
             reading = read_extract(item.path, grid, at=item.date)
         except CoverageError:
             continue
         except ExtractError as error:
             tell(f"passed over: {error}")
             continue
+        outlines.add(outline)
         west, south, east, north = grid.bounds_m
         found = Covering(extract=item, reading=reading, share=reading.coverage.area / (east - west) / (north - south))
         if found.share >= WHOLE:
@@ -347,7 +347,9 @@ def _covering(grid: Grid, folders: Sequence[Path], days: Days | None, *, most_mb
     area = shapely.box(*lonlat_box(grid))
     lack = f"no extract in {', '.join(map(str, places))} covers {box_text(area.bounds)} (west, south, east, north)"
     turned = shapely.transform(area, lambda lonlat: lonlat[:, ::-1])
-    other = next((item for item in at_hand if any(shapely.box(*box).covers(turned) for box in item.boxes)), None)
+    other = next(
+        (item for item in at_hand if any(shapely.box(*box).covers(turned) for box in item.header.boxes_lonlat)), None
+    )
     if other is not None:
         raise ExtractError(f"{lack}, and {other.path.name} covers {box_text(turned.bounds)}: longitude comes first")
     if days is None and most_mb > 0:

@@ -28,6 +28,7 @@ _MOST_QUOTED: Final = 200  # characters of an error of osmium, which quotes a va
 _GZIP_MARK: Final = b"\x1f\x8b"
 _BZIP2_MARK: Final = b"BZh"
 _EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium returns 1970-01-01 for an object without a time
+_MOST_FEATURES: Final = 16  # that a header lists; all known ones are four
 OBJECTS: Final = osmium.osm.NODE | osmium.osm.WAY | osmium.osm.RELATION  # changesets have no versions
 
 
@@ -311,13 +312,17 @@ def _survey(path: Path) -> _Survey:
         return _Survey(is_flagged=True)
     kinds, ids, versions = array("q"), array("q"), array("q")
     deleted, has_places = 0, False
+    # A PBF file says so in its header if ways may carry places: to look at all their nodes takes longer than all else
+    features = {header.get(f"pbf_optional_feature_{number}") for number in range(_MOST_FEATURES)}
+    may_have_places = _is_xml(path) or "LocationsOnWays" in features
     wanted = osmium.osm.WAY | osmium.osm.RELATION if header.get("sorting") == "Type_then_ID" else OBJECTS
     for item in elements(osmium.FileProcessor(str(path), wanted)):
         kinds.append(("n", "w", "r").index(item.type_str()))  # in osmium's order
         ids.append(item.id)
         versions.append(item.version)
         deleted += not item.visible
-        has_places = has_places or (item.is_way() and any(node.location.valid() for node in item.nodes))
+        if may_have_places and not has_places and item.is_way():
+            has_places = any(node.location.valid() for node in item.nodes)
     number = np.array(ids, dtype=np.int64)
     # osmium's order: by type, negative ids first, then by the size of the id.
     keys = np.column_stack((np.array(kinds, dtype=np.int64), number > 0, np.abs(number)))

@@ -12,6 +12,7 @@ from .cli.regions import new_region as new_region
 from .cli.regions import propose_regions as propose_regions
 from .cli.regions import render_imagery as render_imagery
 from .cli.runs import run as run
+from .cli.splits import new_split as new_split
 from .core.storage import fetch as fetch
 from .core.storage import send as send
 from .core.texts import MOST_CANDIDATES as MOST_CANDIDATES

@@ -41,6 +41,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "measure-ageing": "ageing",
     },
     "Queries": {
+        "new-split": "splits",
         "make-queries": "queries",
         "segment": "segmenters",
         "inspect": "looking",

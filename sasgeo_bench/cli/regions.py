@@ -191,11 +191,11 @@ def new_region(options: NewRegionOptions) -> Path:
     Raises
     ------
     ConfigError
-        If the place is not given once, cannot be read or lies in two, or the file is there and is of another region.
+        If the place is not given once, cannot be read or lies in two.
     ExtractError
         If no extract covers the place.
     StoreError
-        If a file cannot be written.
+        If a file cannot be written, or is there and is of another region.
 
     Examples
     --------

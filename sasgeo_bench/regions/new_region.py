@@ -4,7 +4,6 @@
 import calendar
 import datetime as dt
 import math
-import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
@@ -20,8 +19,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.config import parse_toml, shipped_dir
 from sasgeo_bench.core.errors import ConfigError, CoverageError, ExtractError, counted
-from sasgeo_bench.core.folders import fresh_file, scratch_folder, sha256_of
-from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.folders import check_free, fresh_file, scratch_folder, sha256_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
@@ -263,11 +261,11 @@ def new_region(
     Raises
     ------
     ConfigError
-        If the name or the place cannot be that of a region, or the file is there and is of another region.
+        If the name or the place cannot be that of a region.
     ExtractError
         If no extract covers the place; the line names the regional extracts to get.
     StoreError
-        If a file cannot be written.
+        If a file cannot be written, or is there and is of another region.
     """
     if not _NAME.fullmatch(name):
         raise ConfigError(
@@ -295,27 +293,15 @@ def new_region(
             fields |= _stated(found, grid)
         provenance = {"country": place.country, "dated_by": item.date_known_by, "source": source}
         path, text = into / f"{name}.toml", region_text(fields, provenance=provenance, extracts=[extract])
-        _check_free(path, text)
+        is_new = check_free(path, text)
         if keep_cut:
             with fresh_file(into / cut.name, mend=_MEND) as target:
                 copyfile(cut, target)
             tell(f"{into / cut.name}: the place, cut out of {item.path.name}, SHA-256 {extract.sha256[0]}")
-    with fresh_file(path, mend=_MEND) as target:
-        target.write_text(text, encoding="utf-8")
+    if is_new:
+        with fresh_file(path, mend=_MEND) as target:
+            target.write_text(text, encoding="utf-8")
     return path
-
-
-def _check_free(path: Path, text: str) -> None:
-    """Refuse a path at which another region file lies; a line says if the same one does."""
-    if not os.path.lexists(path):
-        return
-    with suppress(OSError, UnicodeDecodeError):
-        if plain_file(path).read_text(encoding="utf-8") == text:
-            tell(f"{path} is there already")
-            return
-    raise ConfigError(
-        f"{path} is there, and is of another place or extract: remove it, or choose another name or --into"
-    )
 
 
 def _grown(box: Box, margin_m: float) -> Box:

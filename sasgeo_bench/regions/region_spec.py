@@ -2,7 +2,6 @@
 """RegionFile: the definition of a place in `regions/*.toml`."""
 
 import datetime as dt
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,7 +11,15 @@ import pyproj
 import shapely
 from pydantic import ConfigDict, Field, StringConstraints, field_validator, model_validator
 
-from sasgeo_bench.core.config import Document, Line, NamedDocument, find_document, list_documents, read_document
+from sasgeo_bench.core.config import (
+    Document,
+    Line,
+    NamedDocument,
+    find_document,
+    list_documents,
+    read_document,
+    toml_value,
+)
 from sasgeo_bench.core.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
@@ -69,7 +76,7 @@ class OwnMap(Document):
     ... attribution = "the land survey"
     ... publish = true
     ... '''
-    >>> parse_toml(text, OwnMap, source="[[own_map]]").credit
+    >>> parsetoml_value(text, OwnMap, source="[[own_map]]").credit
     'building: the land survey (CC0-1.0)'
     """
 
@@ -115,7 +122,7 @@ class RegionFile(NamedDocument):
     ... date = 2024-01-01
     ... sha256 = ["0000000000000000000000000000000000000000000000000000000000000000"]
     ... '''
-    >>> parse_toml(text, RegionFile, source="mine.toml").grid().shape
+    >>> parsetoml_value(text, RegionFile, source="mine.toml").grid().shape
     (256, 256)
     """
 
@@ -397,16 +404,11 @@ def region_text(
     stated = {name: text for name, text in provenance.items() if text}
     lines = [
         "# Extract (c) OpenStreetMap contributors, ODbL 1.0.",
-        *(f"{key} = {_toml(fields[key])}" for key in fields),
+        *(f"{key} = {toml_value(fields[key])}" for key in fields),
     ]
-    lines += ["", "[provenance]", *(f"{name} = {_toml(text)}" for name, text in stated.items())] if stated else []
+    lines += ["", "[provenance]", *(f"{name} = {toml_value(text)}" for name, text in stated.items())] if stated else []
     for extract in extracts:
-        hashes = "".join(f"  {_toml(each)},\n" for each in extract.sha256)
-        lines += ["", "[[extract]]", f"file = {_toml(extract.file)}", f"date = {extract.date.isoformat()}"]
-        lines += [f"sha256 = [\n{hashes}]", *([f"urls = [{_toml(extract.urls[0])}]"] if extract.urls else [])]
+        hashes = "".join(f"  {toml_value(each)},\n" for each in extract.sha256)
+        lines += ["", "[[extract]]", f"file = {toml_value(extract.file)}", f"date = {extract.date.isoformat()}"]
+        lines += [f"sha256 = [\n{hashes}]", *([f"urls = [{toml_value(extract.urls[0])}]"] if extract.urls else [])]
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: object) -> str:
-    """Return a text, a number, or a list of them, as TOML writes it: here as JSON does."""
-    return json.dumps(value, ensure_ascii=False)

@@ -12,7 +12,7 @@ import pytest
 import rasterio
 from PIL import ExifTags, Image
 
-from sasgeo_bench.core.errors import ConfigError, ExtractError
+from sasgeo_bench.core.errors import ConfigError, ExtractError, StoreError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.osm.regional import RegionalExtract
@@ -237,7 +237,7 @@ def test_a_region_file_that_is_there_stays_and_is_refused_if_it_is_another(garde
     lines = told(lambda: new_region("mine", PLACE, into=tmp_path, folders=[garden], keep_cut=True))
     assert f"{path} is there already" in lines
     other = Place.around(f"{LON},{LAT}", "200m")
-    with pytest.raises(ConfigError, match="is there, and is of another place or extract"):
+    with pytest.raises(StoreError, match="is there, and says something else"):
         new_region("mine", other, into=tmp_path, folders=[garden], keep_cut=True)
     assert {one.name: one.read_bytes() for one in tmp_path.iterdir()} == before
 

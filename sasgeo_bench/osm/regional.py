@@ -72,7 +72,7 @@ def regional_extracts_of(area_lonlat: shapely.Geometry) -> tuple[RegionalExtract
     return tuple(item for _, item in sorted(holding, key=lambda pair: pair[0]))
 
 
-def download_regional(area_lonlat: shapely.Geometry, *, most_mb: float) -> tuple[Path, RegionalExtract]:
+def download_regional(area_lonlat: shapely.Geometry, *, most_mb: float) -> Path:
     """Download the smallest regional extract whose outline holds an area into the user's cache, named by its day.
 
     What was loaded of a file before it broke off is kept, and is not loaded again. Raise `ExtractError` if the server
@@ -89,7 +89,7 @@ def download_regional(area_lonlat: shapely.Geometry, *, most_mb: float) -> tuple
         loaded = _load(address_of(found.name), folder, most_mb=most_mb)
         header = read_header(loaded)
         day = header.replicated_at.date().isoformat() if header.replicated_at else "undated"
-        return loaded.replace(folder / f"{found.name.rpartition('/')[2]}-{day}.osm.pbf"), found
+        return loaded.replace(folder / f"{found.name.rpartition('/')[2]}-{day}.osm.pbf")
 
 
 def _outline(item: RegionalExtract) -> shapely.Geometry:

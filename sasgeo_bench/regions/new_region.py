@@ -37,6 +37,8 @@ from sasgeo_bench.regions.scenes import ground_of
 
 MARGIN_M: Final = 500.0  # around photos, and of a cut around the place
 APART_M: Final = 10_000.0  # photos farther apart than this are of two places
+LARGE_BYTES: Final = 100_000_000  # of an extract that is cut before it is read: reading looks at all its objects
+LARGE_MARGIN_M: Final = 5_000.0  # of that cut: wide enough to show where the extract itself ends
 WHOLE: Final = 0.99  # share of a place that an extract that covers it maps: ground by a cut way may be unknown
 _EARTH_M: Final = 6_371_000.0
 _POLE_DEG: Final = 90.0
@@ -183,9 +185,10 @@ class AtHand:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Covering:
-    """The extract of a place, what was read of it, and the share of the place that it maps."""
+    """The extract of a place, the file that was read (itself, or a cut out of it), and the share that it maps."""
 
     extract: AtHand
+    path: Path
     reading: Reading
     share: float
 
@@ -209,10 +212,11 @@ def list_at_hand(folders: Sequence[Path], *, days: Days | None = None) -> list[A
     )
 
 
-def find_covering(grid: Grid, extracts: Sequence[AtHand]) -> Covering | None:
+def find_covering(grid: Grid, extracts: Sequence[AtHand], *, scratch: Path) -> Covering | None:
     """Return the first extract that maps the whole of a grid, else the one that maps most of it, with a line, or None.
 
-    An extract is read only if its bounds meet the grid, and none of the same bounds was before it.
+    An extract is read only if its bounds meet the grid, and none of the same bounds was before it. Of one of more than
+    `LARGE_BYTES` what lies around the grid is cut into the folder `scratch`, and the cut is read.
     """
     area = shapely.box(*lonlat_box(grid))
     best: Covering | None = None
@@ -224,7 +228,12 @@ def find_covering(grid: Grid, extracts: Sequence[AtHand]) -> Covering | None:
             most = bounds.intersection(area).area / area.area
             if outline in outlines or most <= (best.share if best else 0.0):
                 continue
-            reading = read_extract(item.path, grid, at=item.date)
+            path = item.path
+            if path.stat().st_size > LARGE_BYTES:
+                tell(f"{path.name} is large ({path.stat().st_size / 1e6:,.0f} MB): cutting the place out of it")
+                path = scratch / f"around-{path.name.partition('.')[0]}.osm.pbf"
+                cut_extract(item.path, path, _grown(lonlat_box(grid), LARGE_MARGIN_M), at=item.date)
+            reading = read_extract(path, grid, at=item.date)
         except CoverageError:
             continue
         except ExtractError as error:
@@ -232,7 +241,8 @@ def find_covering(grid: Grid, extracts: Sequence[AtHand]) -> Covering | None:
             continue
         outlines.add(outline)
         west, south, east, north = grid.bounds_m
-        found = Covering(extract=item, reading=reading, share=reading.coverage.area / (east - west) / (north - south))
+        share = reading.coverage.area / (east - west) / (north - south)
+        found = Covering(extract=item, path=path, reading=reading, share=share)
         if found.share >= WHOLE:
             return found
         best = found if best is None or found.share > best.share else best
@@ -279,18 +289,20 @@ def new_region(
     grid = parse_toml(
         region_text(fields, provenance={}, extracts=[nothing]), RegionFile, source=f"region {name}"
     ).grid()
-    found, source = _covering(grid, folders, days, most_mb=most_mb)
-    item = found.extract
-    tell(item.to_text())
-    fields["scenes"] = list(ground_of(found.reading, item.path, grid, at=item.date).scenes())
-    extract = Extract(file=item.path.name, date=item.date, sha256=(item.sha256,))
     with scratch_folder("cut") as scratch:
-        cut = scratch / f"{name}-{item.date}.osm.pbf"
+        found = _covering(grid, folders, days, most_mb=most_mb, scratch=scratch)
+        item = found.extract
+        tell(item.to_text())
+        fields["scenes"] = list(ground_of(found.reading, found.path, grid, at=item.date).scenes())
+        extract = Extract(file=item.path.name, date=item.date, sha256=(item.sha256,))
+        cut, source = scratch / f"{name}-{item.date}.osm.pbf", None
         if keep_cut:
-            cut_extract(item.path, cut, _grown(lonlat_box(grid), MARGIN_M), at=item.date)
+            cut_extract(found.path, cut, _grown(lonlat_box(grid), MARGIN_M), at=item.date)
             extract = Extract(file=cut.name, date=item.date, sha256=(sha256_of(cut),))
-            source = f"cut out of {item.path.name}, SHA-256 {item.sha256}" + (f", {source}" if source else "")
+            source = f"cut out of {item.path.name}, SHA-256 {item.sha256}"
             fields |= _stated(found, grid)
+        elif found.path != item.path:
+            tell(f"build-region will read the whole of {item.path.name}: --keep-cut spares that")
         provenance = {"country": place.country, "dated_by": item.date_known_by, "source": source}
         path, text = into / f"{name}.toml", region_text(fields, provenance=provenance, extracts=[extract])
         is_new = check_free(path, text)
@@ -317,19 +329,19 @@ def _stated(found: Covering, grid: Grid) -> dict[str, object]:
         # 10 m: the edge of the place lies inside
         west, south, east, north = (round(side, 6) for side in _grown(lonlat_box(grid), 10.0))
         return {"coverage_lonlat": [[west, south], [east, south], [east, north], [west, north]]}
-    parts = shapely.get_parts(shapely.simplify(found.reading.coverage, 1.0))
+    parts = shapely.get_parts(found.reading.coverage)
     rings = [shapely.get_coordinates(shapely.get_exterior_ring(part)) for part in parts if part.geom_type == "Polygon"]
     change = to_lonlat(grid.epsg)
     return {"coverage_parts_lonlat": [np.column_stack(change.transform(*ring.T)).round(6).tolist() for ring in rings]}
 
 
-def _covering(grid: Grid, folders: Sequence[Path], days: Days | None, *, most_mb: float) -> tuple[Covering, str | None]:
-    """Return what covers a grid and where it was downloaded from, if it was; raise `ExtractError` if nothing does."""
+def _covering(grid: Grid, folders: Sequence[Path], days: Days | None, *, most_mb: float, scratch: Path) -> Covering:
+    """Return what covers a grid, at hand or downloaded; raise `ExtractError` if nothing does."""
     places = extract_folders(folders)
     at_hand = list_at_hand(places, days=days)
-    found = find_covering(grid, at_hand)
+    found = find_covering(grid, at_hand, scratch=scratch)
     if found is not None:
-        return found, None
+        return found
     area = shapely.box(*lonlat_box(grid))
     lack = f"no extract in {', '.join(map(str, places))} covers {box_text(area.bounds)} (west, south, east, north)"
     turned = shapely.transform(area, lambda lonlat: lonlat[:, ::-1])
@@ -340,12 +352,12 @@ def _covering(grid: Grid, folders: Sequence[Path], days: Days | None, *, most_mb
         raise ExtractError(f"{lack}, and {other.path.name} covers {box_text(turned.bounds)}: longitude comes first")
     if days is None and most_mb > 0:
         try:
-            path, loaded = download_regional(area, most_mb=most_mb)
-            found = find_covering(grid, [_at_hand(path, None)])
+            path = download_regional(area, most_mb=most_mb)
+            found = find_covering(grid, [_at_hand(path, None)], scratch=scratch)
         except ExtractError as error:
             lack += f"; {error}"
         if found is not None:
-            return found, address_of(loaded.name)
+            return found
     regional = list(dict.fromkeys(item.name for item in regional_extracts_of(area)))
     if not regional:
         raise ExtractError(f"{lack}: no regional extract is known of it")

@@ -119,8 +119,7 @@ def provider(tmp_path, monkeypatch):
 
 
 def test_a_download_is_named_by_the_day_of_its_content_and_nothing_else_is_left(provider, tmp_path):
-    path, item = download_regional(PLACE, most_mb=10)
-    assert item.name == "europe/andorra"
+    path = download_regional(PLACE, most_mb=10)
     stated = read_header(path).replicated_at
     assert path == tmp_path / "cache" / f"andorra-{stated.date() if stated else 'undated'}.osm.pbf"
     assert path.read_bytes() == provider.files["/europe/andorra-latest.osm.pbf"]
@@ -133,7 +132,7 @@ def test_the_outline_passes_over_a_neighbour_whose_box_holds_the_place(provider)
         provider.files["/europe/andorra.poly"],
     )
     provider.files["/europe/spain-latest.osm.pbf"] = provider.files["/europe/andorra-latest.osm.pbf"]
-    assert download_regional(PLACE, most_mb=10)[1].name == "europe/spain"
+    assert download_regional(PLACE, most_mb=10).name.startswith("spain-")
 
 
 def test_what_broke_off_goes_on_where_it_ended(provider, tmp_path):
@@ -143,7 +142,7 @@ def test_what_broke_off_goes_on_where_it_ended(provider, tmp_path):
         download_regional(PLACE, most_mb=10)
     assert [one.suffix for one in (tmp_path / "cache").iterdir()] == [".part"]
     provider.broken.clear()
-    path, _ = download_regional(PLACE, most_mb=10)
+    path = download_regional(PLACE, most_mb=10)
     assert path.read_bytes() == provider.files[file]
     assert f"{file} {len(provider.files[file]) // 2}" in provider.asked
 

@@ -15,7 +15,6 @@ from PIL import ExifTags, Image
 from sasgeo_bench.core.errors import ConfigError, ExtractError, StoreError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import reporting
-from sasgeo_bench.osm.regional import RegionalExtract
 from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
 from sasgeo_bench.regions import new_region as one_region
 from sasgeo_bench.regions.new_region import Days, Place, list_at_hand, new_region
@@ -215,13 +214,12 @@ def test_a_regional_extract_is_downloaded_where_none_is_at_hand_and_no_date_is_a
 
     def download(_, *, most_mb):
         asked.append(most_mb)
-        return garden / NEW, RegionalExtract(name="europe/liechtenstein", box=(9.4, 47.0, 9.7, 47.3))
+        return garden / NEW
 
     monkeypatch.setattr(one_region, "download_regional", download)
     path = new_region("mine", PLACE, into=tmp_path, most_mb=7.0)
     spec = read_region_file(path)
     assert (asked, spec.extract[0].file) == ([7.0], NEW)
-    assert spec.provenance.source == "https://download.geofabrik.de/europe/liechtenstein-latest.osm.pbf"
     for words in ({"most_mb": 0.0}, {"most_mb": 7.0, "days": Days.read("2015")}):
         with pytest.raises(ExtractError, match="no extract in"):
             new_region("other", PLACE, into=tmp_path, **words)
@@ -324,6 +322,17 @@ def test_a_mistake_is_one_line(words, line, mistake, tmp_path):
     Image.new("L", (4, 3)).save(tmp_path / "bare" / "a.jpg")
     assert line in mistake("new-region", "mine", *words, "--quiet")
     assert not (tmp_path / "my-regions").exists()
+
+
+def test_a_large_extract_is_cut_before_it_is_read_and_gives_the_same(garden, tmp_path, monkeypatch):
+    whole = new_region("mine", PLACE, into=tmp_path / "a", folders=[garden])
+    monkeypatch.setattr(one_region, "LARGE_BYTES", 1000)
+    lines = told(lambda: new_region("mine", PLACE, into=tmp_path / "b", folders=[garden]))
+    assert f"{NEW} is large (" in lines
+    assert "--keep-cut spares that" in lines
+    assert (tmp_path / "b/mine.toml").read_bytes() == whole.read_bytes()
+    lines = told(lambda: new_region("mine", PLACE, into=tmp_path / "c", folders=[garden], keep_cut=True))
+    assert "spares" not in lines
 
 
 @pytest.mark.real

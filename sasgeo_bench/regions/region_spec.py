@@ -76,7 +76,7 @@ class OwnMap(Document):
     ... attribution = "the land survey"
     ... publish = true
     ... '''
-    >>> parsetoml_value(text, OwnMap, source="[[own_map]]").credit
+    >>> parse_toml(text, OwnMap, source="[[own_map]]").credit
     'building: the land survey (CC0-1.0)'
     """
 
@@ -122,7 +122,7 @@ class RegionFile(NamedDocument):
     ... date = 2024-01-01
     ... sha256 = ["0000000000000000000000000000000000000000000000000000000000000000"]
     ... '''
-    >>> parsetoml_value(text, RegionFile, source="mine.toml").grid().shape
+    >>> parse_toml(text, RegionFile, source="mine.toml").grid().shape
     (256, 256)
     """
 

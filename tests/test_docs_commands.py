@@ -44,6 +44,7 @@ DOCUMENTS = (
 ONLY_PARSED = {
     r"vaduz|liechtenstein": "needs an extract of Liechtenstein",
     r"--extracts|--extract ": "needs extracts",
+    r"^sasgeo-bench new-region |my-place": "needs extracts; tests/regions/test_new_region.py makes some",
     r"--imagery|zanzibar": "needs aerial pictures; tests/regions/test_imagery.py makes some",
     r"^sasgeo-bench leaderboard (?!.*--dry-run)": "too long; tests/experiments/test_pipeline.py does a small one",
     r"(check|--matcher|runs/) ?my-tracker": "half a minute; tests/running/test_tracker_testing.py flies it",

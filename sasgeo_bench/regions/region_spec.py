@@ -3,7 +3,7 @@
 
 import datetime as dt
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
@@ -11,7 +11,14 @@ import pyproj
 import shapely
 from pydantic import ConfigDict, Field, StringConstraints, field_validator, model_validator
 
-from sasgeo_bench.core.config import Line, NamedDocument, find_document, list_documents, read_document
+from sasgeo_bench.core.config import (
+    Line,
+    NamedDocument,
+    find_document,
+    list_documents,
+    read_document,
+    toml_value,
+)
 from sasgeo_bench.core.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
@@ -448,3 +455,26 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
     """
     return find_document(id_or_path, "region", "list regions shows all", lambda: list_region_files(folders=folders))
+
+
+def region_text(
+    fields: Mapping[str, object], *, provenance: Mapping[str, str | None], extracts: Sequence[Extract]
+) -> str:
+    """Return the text of a region file: its keys in their order, lines of provenance that are known, and extracts.
+
+    >>> extract = Extract(file="mine.osm.pbf", date=dt.date(2024, 1, 1), sha256=("0" * 64,))
+    >>> text = region_text({"id": "mine", "size_m": [512, 512]}, provenance={"country": None}, extracts=[extract])
+    >>> text.splitlines()[1:5]
+    ['id = "mine"', 'size_m = [512, 512]', '', '[[extract]]']
+    """
+    stated = {name: text for name, text in provenance.items() if text}
+    lines = [
+        "# Extract (c) OpenStreetMap contributors, ODbL 1.0.",
+        *(f"{key} = {toml_value(fields[key])}" for key in fields),
+    ]
+    lines += ["", "[provenance]", *(f"{name} = {toml_value(text)}" for name, text in stated.items())] if stated else []
+    for extract in extracts:
+        hashes = "".join(f"  {toml_value(each)},\n" for each in extract.sha256)
+        lines += ["", "[[extract]]", f"file = {toml_value(extract.file)}", f"date = {extract.date.isoformat()}"]
+        lines += [f"sha256 = [\n{hashes}]", *([f"urls = [{toml_value(extract.urls[0])}]"] if extract.urls else [])]
+    return "\n".join(lines) + "\n"

@@ -21,7 +21,7 @@ HOUSE = (
     "core",
     # The pipeline.
     *("geometry", "osm", "regions", "ageing", "search", "sensing", "flights", "tasks"),
-    *("matching", "sasgeo", "running"),
+    *("matching", "sasgeo", "running", "observing"),
     *("scoring", "boards", "exchange", "experiments", "cli", "__main__"),
 )
 

@@ -71,7 +71,7 @@ class PicturePose:
     --------
     >>> pose = PicturePose(name="a.jpg", place=(9.0, 47.0), attitude=Attitude(pitch_deg=-60.0, yaw_deg=90.0))
     >>> round(pose.tilt_deg), [round(value) for value in pose.in_crs(32632)]
-    (30, [500000, 5205329])
+    (30, [500000, 5205164])
     """
 
     name: str
@@ -293,7 +293,7 @@ def picture_heading_deg(attitude: Attitude) -> float:
     """Return the heading of a picture's up, degrees from true north in [0, 360).
 
     >>> picture_heading_deg(Attitude(pitch_deg=-90.0, yaw_deg=30.0, roll_deg=10.0))
-    20.0
+    40.0
     """
     north, east, _ = (-attitude.matrix[:, 2]).tolist()
     return round(float(bearing_deg(east, north)), 9) % 360.0

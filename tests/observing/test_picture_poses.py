@@ -21,7 +21,7 @@ from sasgeo_bench.observing.picture_poses import (
     picture_heading_deg,
 )
 from sasgeo_bench.sensing.camera import Attitude
-from tests.observing.cameras import body, camera
+from tests.pose_files import body, camera
 
 BALI = (115.46, -8.29)
 

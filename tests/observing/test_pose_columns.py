@@ -10,7 +10,7 @@ import pytest
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.sensing.camera import Attitude
-from tests.observing.cameras import about, body
+from tests.pose_files import about, body
 
 PLACE = "115.46,-8.29"
 

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.sensing.camera import Intrinsics
-from tests.observing import cameras
-from tests.observing.cameras import NAMES, ORIGIN, SHIFTS, local
+from tests import pose_files as cameras
+from tests.pose_files import NAMES, ORIGIN, SHIFTS, local
 
 LOCAL = PoseFacts(origin=ORIGIN)
 TURN = cameras.camera(37.0, -63.0, 11.0)

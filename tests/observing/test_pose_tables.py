@@ -16,8 +16,8 @@ from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.sensing.photos import read_photo
-from tests.observing import cameras
-from tests.observing.cameras import ANGLES, NAMES, ORIGIN, SHIFTS, UTM, local, matrices, places, utm
+from tests import pose_files as cameras
+from tests.pose_files import ANGLES, NAMES, ORIGIN, SHIFTS, UTM, local, matrices, places, utm
 
 
 @pytest.fixture

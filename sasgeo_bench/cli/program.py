@@ -39,6 +39,9 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "render-imagery": "regions",
         "measure-ageing": "ageing",
     },
+    "Your own pictures": {
+        "locate": "observing",
+    },
     "Queries": {
         "make-queries": "queries",
         "segment": "segmenters",
@@ -96,6 +99,7 @@ KEPT: Final = {
     "build-region": "regions that were built are kept; the same command builds the others",
     "render-imagery": "images that were rendered are kept; the same command renders the others",
     "make-queries": "tasks that were drawn are kept; the same command draws them again, with the same queries",
+    "locate": "fixes so far are kept; the same command goes on with the other pictures",
     "segment": "tasks that were segmented are kept; the same command goes on with the others",
     "run": "answers so far are kept; the same command asks the other queries",
     "enter": "queries and answers so far are kept; the same command goes on from there",

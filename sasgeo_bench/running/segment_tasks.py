@@ -9,14 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from sasgeo_bench.core.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reporting, spread, tell
 from sasgeo_bench.matching.cards import write_learned
 from sasgeo_bench.matching.segmenter import check_text
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
 from sasgeo_bench.running.training import SegmentedQuery, recalibrated
@@ -25,7 +22,7 @@ from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.build import put_task
-from sasgeo_bench.tasks.frame_evidence import evidence_of
+from sasgeo_bench.tasks.frame_evidence import evidence_of, for_classes
 from sasgeo_bench.tasks.frames import read_labels
 from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of, view_id
 from sasgeo_bench.tasks.segmented import Segmented, segmented_file, write_segmented
@@ -350,23 +347,12 @@ def _with_evidence(
     if query.frames:
         size_cells, cell_size_m = evidence.shape[0], evidence.cell_size_m
         found = evidence_of(query.frames, seen, size_cells=size_cells, cell_size_m=cell_size_m)
-        evidence = _for_classes(found, evidence)
+        evidence = for_classes(found, evidence)
     asked = _renamed(query, segmenter)
     return (
         replace(asked, suite=suite, evidence=evidence),
         replace(truth, query_id=asked.query_id, unknown_share=evidence.unknown_share),
     )
-
-
-def _for_classes(found: Evidence | None, empty: Evidence) -> Evidence:
-    """Return evidence for the classes of a map, in their order: unknown where a segmenter tells nothing of one."""
-    cells = np.full(empty.cells.shape, UNKNOWN, dtype=np.uint8)
-    confidence = np.zeros(empty.cells.shape, dtype=np.uint8)
-    for index, name in enumerate(empty.classes):
-        if found is not None and found.confidence is not None and name in found.classes:
-            at = found.classes.index(name)
-            cells[index], confidence[index] = found.cells[at], found.confidence[at]
-    return empty.replace(cells, confidence)
 
 
 def _renamed(query: Query, segmenter: str) -> Query:

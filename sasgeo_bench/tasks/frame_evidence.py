@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.sensing.accumulation import Errors, accumulate, steps_between
 from sasgeo_bench.sensing.birdseye import Reading, see_ground
 from sasgeo_bench.sensing.ground import Plane
@@ -74,6 +74,17 @@ def evidence_of(
     if len(views) > 1:
         together = accumulate(views, steps_between(poses), errors=_errors(frames), height_m=last.height_m)
     return together.to_evidence(reading)
+
+
+def for_classes(found: Evidence | None, empty: Evidence) -> Evidence:
+    """Return evidence for the classes of a map, in their order: unknown where a segmenter tells nothing of one."""
+    cells = np.full(empty.cells.shape, UNKNOWN, dtype=np.uint8)
+    confidence = np.zeros(empty.cells.shape, dtype=np.uint8)
+    for index, name in enumerate(empty.classes):
+        if found is not None and found.confidence is not None and name in found.classes:
+            at = found.classes.index(name)
+            cells[index], confidence[index] = found.cells[at], found.confidence[at]
+    return empty.replace(cells, confidence)
 
 
 def _errors(frames: Sequence[Frame]) -> Errors:

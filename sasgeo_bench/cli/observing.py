@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands for a user's own pictures: locate."""
+
+import hashlib
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress
+from sasgeo_bench.cli.options import Options, Out, takes
+from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.observing.locate import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
+from sasgeo_bench.observing.locate import locate as located_by
+from sasgeo_bench.observing.pictures import Told
+from sasgeo_bench.observing.results import PAGE, Strips, write_results
+from sasgeo_bench.regions.region_files import read_region
+
+_HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
+_PAIR: Final = re.compile(r"\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*,\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*")
+_SIGMA_DEG: Final = 10.0  # of a heading that is given alone
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocateOptions(Options):
+    """Flags of locate."""
+
+    pictures: Annotated[Path, typer.Argument(help="a picture, or a folder of them (JPEG, PNG, WebP, GeoTIFF)")] = field(
+        kw_only=False
+    )
+    region: Annotated[str | None, typer.Option(help="built region, or its folder; default: the newest that fits")] = (
+        None
+    )
+    near: Annotated[str | None, typer.Option(help="LON,LAT of the middle of the search; default: the file's")] = None
+    radius: Annotated[float, typer.Option(help="of the search, metres")] = RADIUS_M
+    heading: Annotated[
+        str | None, typer.Option(help="of the picture's up, DEG or DEG+-DEG from true north, or 'any'")
+    ] = None
+    height: Annotated[float | None, typer.Option(help="of the camera above the ground, metres")] = None
+    ground_width: Annotated[float | None, typer.Option(help="width of the ground in each picture, metres")] = None
+    matcher: Annotated[str, typer.Option(help="name from list matchers, or module:Class")] = MATCHER
+    segmenter: Annotated[str, typer.Option(help="name from list segmenters, with weights, or module:Class")] = SEGMENTER
+    exif_position: Annotated[
+        bool, typer.Option("--exif-position/--no-exif-position", help="search around the position in the file")
+    ] = True
+    most_false: Annotated[float, typer.Option(help="P(false fix) up to which a fix is accepted")] = MOST_FALSE
+    trusted: Annotated[bool, typer.Option("--trusted", help="run without the sandbox")] = False
+    into: Annotated[Path | None, typer.Option(help="folder of the results; default: OUT/locate/NAME")] = None
+    out: Out = Path("out")
+
+
+@takes(LocateOptions)
+def locate(options: LocateOptions) -> Located:
+    """Find out where pictures were taken, and how far to trust it; a page shows what was seen and where it fits.
+
+    The position in a file is the middle of nothing: it lies anywhere in the disc that is searched, so that it can be
+    no answer. A second call goes on where the first was cut off.
+
+    Returns
+    -------
+    Located
+        A fix for each picture, in their order, and the map. Tables and a page lie in `into`.
+
+    Raises
+    ------
+    ConfigError
+        If an option makes no sense, or no built region holds the place.
+    ImageError
+        If there is no picture. One that cannot be read is a row, no error.
+    MatchError
+        If the matcher or the segmenter cannot be loaded.
+    StoreError
+        If the region is missing or damaged, or the results cannot be written.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> sgb.locate("garden.jpg")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.core.errors.ImageError: there is no picture or folder garden.jpg: check the path
+    """
+    into = options.into or options.out / "locate" / _name_of(options.pictures)
+    heading = None if options.heading in (None, "any") else _heading(options.heading or "")
+    request = LocateRequest(
+        pictures=options.pictures,
+        out=options.out,
+        into=into,
+        region=None if options.region is None else _region(options.region, options.out),
+        near=None if options.near is None else _lonlat(options.near),
+        radius_m=options.radius,
+        heading=heading,
+        is_turned=options.heading == "any",
+        told=Told(height_m=options.height, ground_width_m=options.ground_width),
+        matcher=options.matcher,
+        segmenter=options.segmenter,
+        uses_position=options.exif_position,
+        most_false=options.most_false,
+        is_sandboxed=not options.trusted,
+    )
+    found = located_by(request, lambda region: Strips(into, partial(read_region, region)))
+    for fix in found.fixes:
+        options.say(line_of(fix))
+    for note in (found.calibration, *notes_of(found.fixes)):
+        tell(note)
+    write_results(found, read_region(found.region))
+    return found
+
+
+def line_of(fix: Fix) -> str:
+    """Return what a terminal shows of a fix.
+
+    >>> line_of(Fix(file="a.jpg", status="failed", reason="damaged"))
+    'a.jpg: failed: damaged'
+    """
+    words: list[str] = [fix.status]
+    if fix.lon is not None and fix.heading_deg is not None:
+        words.append(f"{fix.lon:.6f},{fix.lat:.6f} ({fix.x_m:.0f} m east, {fix.y_m:.0f} m north)")
+        words.append(f"heading {fix.heading_deg:.0f} deg")
+    if fix.p_false is not None:
+        words.append(f"P(false fix) {fix.p_false:.3f}")
+    if fix.file_distance_m is not None:
+        words.append(f"{fix.file_distance_m:.0f} m from the file's position")
+    text = f"{fix.file}: {', '.join(words)}"
+    return f"{text}: {fix.reason}" if fix.reason else text
+
+
+def notes_of(fixes: Sequence[Fix]) -> list[str]:
+    """Return each note with how many pictures it is of.
+
+    >>> notes_of([Fix(file=name, status="found", note="taken as seen from straight above") for name in "ab"])
+    ['2 pictures: taken as seen from straight above']
+    """
+    counts = Counter(fix.note for fix in fixes if fix.note)
+    return [f"{counted(count, 'picture')}: {note}" for note, count in counts.most_common()]
+
+
+def locate_command(options: LocateOptions) -> None:
+    """Find out where pictures of your own were taken, and how far to trust it: a line for each, tables and a page."""
+    lines: list[object] = []  # printed once the progress bars are gone
+    with shown_progress():
+        found = locate(**vars(options) | {"say": lines.append})
+    for line in lines:
+        say(line)
+    say(found.request.into / PAGE)
+    failed = sum(fix.status == "failed" for fix in found.fixes)
+    if failed:
+        complain(f"{failed} of {len(found.fixes)} pictures could not be read; their rows say why")
+        raise typer.Exit(CONTESTANT_FAILED)
+
+
+def _name_of(pictures: Path) -> str:
+    """Return a name for the results of a file or folder; of unlike paths it is another one."""
+    path = pictures.absolute()
+    stem = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")[:40] or "pictures"
+    return f"{stem}-{hashlib.sha256(str(path).encode()).hexdigest()[:6]}"
+
+
+def _region(name: str, out: Path) -> Path:
+    folder = Path(name)
+    return folder if (folder / "region.json").is_file() else out / "regions" / name
+
+
+def _lonlat(text: str) -> tuple[float, float]:
+    found = _PAIR.fullmatch(text)
+    if found is None:
+        raise ConfigError(f"--near is LON,LAT in degrees, as in 9.52,47.14, got {text!r}")
+    return float(found[1]), float(found[2])
+
+
+def _heading(text: str) -> tuple[float, float]:
+    found = _HEADING.fullmatch(text.replace(" ", ""))
+    if found is None or not (found[2] is None or 0 < float(found[2]) <= 180):
+        raise ConfigError(f"--heading is DEG, DEG+-DEG or 'any', as in 270+-15, got {text!r}")
+    return float(found[1]), _SIGMA_DEG if found[2] is None else float(found[2])

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""P(false fix) of a user's pictures: fitted on answers to real pictures that taught the segmenter nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Annotated, Final
+
+import numpy as np
+from pydantic import Field
+
+from sasgeo_bench.core.config import JsonDocument, check_document
+from sasgeo_bench.core.json import parse_json
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import Prediction, Rejector
+
+FILE: Final = "chances.json"
+_AWAY_M: Final = 1000.0  # where the rival of a stored answer stands: outside any tolerance
+
+
+class Answers(JsonDocument):
+    """Answers of one matcher to pictures seen by one segmenter, as far as P(false fix) is fitted on them.
+
+    A row of `rows` holds the place's number in `places`, whether the answer was false (1) or right (0), its lead over
+    the best rival, its confidence and its diagnostics in the order of `diagnostics`; None where there is none.
+    `segmenters` share the recipe of the one that was asked. `sides_m`, `gsd_m`, `radius_m`, `yaw_sigma_deg` and
+    `scale_sigma` are least and most of the views and priors.
+    """
+
+    matcher: str
+    version: str
+    segmenters: tuple[str, ...]
+    asked: str
+    places: tuple[str, ...]
+    sides_m: tuple[float, float]
+    most_gsd_m: float
+    most_radius_m: float
+    most_yaw_sigma_deg: float
+    most_scale_sigma: float
+    diagnostics: tuple[str, ...]
+    rows: Annotated[tuple[tuple[float | None, ...], ...], Field(min_length=1)]
+
+    def predictions(self) -> list[Prediction]:
+        """Return the answers as a rejector reads them: a first pose, and a rival by its lead."""
+        here, away = (Pose(easting_m=east_m, northing_m=0.0, yaw_deg=0.0) for east_m in (0.0, _AWAY_M))
+        found = []
+        for _, _, lead, confidence, *numbers in self.rows:
+            pairs = zip(self.diagnostics, numbers, strict=True)
+            found.append(
+                Prediction(
+                    query_id="",
+                    candidates=((here, lead or 0.0), (away, 0.0)),
+                    confidence=confidence,
+                    diagnostics={name: number for name, number in pairs if number is not None},
+                )
+            )
+        return found
+
+    @property
+    def is_false(self) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
+        """Return which answers were false, shape (N,)."""
+        return np.array([row[1] == 1 for row in self.rows], dtype=bool)
+
+    @property
+    def text(self) -> str:
+        """Return on what P(false fix) was calibrated, in a line."""
+        places = ", ".join(self.places)
+        return (
+            f"calibrated on {len(self.rows)} answers of {self.matcher} to pictures of {places}, seen by {self.asked}, "
+            "which none of them taught"
+        )
+
+
+@cache
+def shipped_answers() -> tuple[Answers, ...]:
+    """Return the answers that ship, one for each matcher and segmenter."""
+    data = resources.files("sasgeo_bench.observing").joinpath(FILE).read_bytes()
+    return tuple(check_document(item, Answers, source=FILE) for item in parse_json(data))
+
+
+def answers_for(matcher: str, version: str, segmenter: str) -> Answers | None:
+    """Return the answers that fit a matcher of a version and a segmenter; None where none ship."""
+    for one in shipped_answers():
+        if (one.matcher, one.version) == (matcher, version) and segmenter in one.segmenters:
+            return one
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chances:
+    """A rejector that was fitted on stored answers."""
+
+    answers: Answers
+    rejector: Rejector
+
+    @classmethod
+    def of(cls, answers: Answers, *, without: Sequence[str] = ()) -> "Chances":
+        """Fit `sasgeo_logistic`, without the answers of some places if these are named."""
+        from sasgeo_bench.sasgeo.rejectors import SasgeoLogistic  # noqa: PLC0415 - scikit-learn takes a second
+
+        kept = [answers.places[int(row[0] or 0)] not in without for row in answers.rows]
+        items = [item for item, is_kept in zip(answers.predictions(), kept, strict=True) if is_kept]
+        rejector = SasgeoLogistic()
+        rejector.fit(items, answers.is_false[np.array(kept)])
+        return cls(answers=answers, rejector=rejector)
+
+    def p_false(self, answer: Prediction) -> float:
+        """Return the probability that an answer is a false fix."""
+        return float(self.rejector.p_false([answer])[0])

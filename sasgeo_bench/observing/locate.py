@@ -1,0 +1,612 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Locate pictures of a user's own on a map: where the camera stood, and how far to trust it."""
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Final, Literal, Self
+
+import numpy as np
+
+from sasgeo_bench.core import progress
+from sasgeo_bench.core.errors import ConfigError, MatchError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.folders import locked
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import one_line
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.geometry.projection import to_lonlat
+from sasgeo_bench.matching.matcher import MatcherCard, Prediction, lacks
+from sasgeo_bench.matching.segmenter import SegmenterCard
+from sasgeo_bench.observing.chances import Answers, Chances, answers_for
+from sasgeo_bench.observing.pictures import (
+    OwnPicture,
+    Sight,
+    Told,
+    grid_place,
+    list_pictures,
+    names_of,
+    open_picture,
+    see,
+)
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.regions.region_files import read_manifest
+from sasgeo_bench.running.plan import hidden_below, matcher_code, segmenter_code
+from sasgeo_bench.running.segmenting import SegmenterProcess
+from sasgeo_bench.running.worker import Limits, Reach, Worker, guarded
+from sasgeo_bench.sensing.birdseye import to_evidence
+from sasgeo_bench.sensing.ground import Plane
+from sasgeo_bench.sensing.segmentation import Segmentation
+from sasgeo_bench.tasks.frame_evidence import for_classes
+from sasgeo_bench.tasks.frames import Frame, encode_webp
+from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.tasks.task_files import query_bytes
+
+Found = Literal["found", "withheld", "not on this map", "failed"]
+MATCHER: Final = "sasgeo"
+SEGMENTER: Final = "osm_unet"
+RADIUS_M: Final = 500.0
+NOWHERE: Final = 0.9  # from this P(false fix) on, no place of the map explains a picture
+MOST_FALSE: Final = 0.05
+ANSWERS: Final = "answers.jsonl"
+_GIMBAL_SIGMA_DEG: Final = 10.0  # of a drone's compass
+_TOP_K: Final = 25
+_VERSION: Final = 1  # raised when the same question gets another answer by this file
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocateRequest:
+    """Pictures to locate, and what is known of them.
+
+    Parameters
+    ----------
+    pictures : Path
+        A file, or a folder of them.
+    out : Path
+        Root of what is built; regions lie in `out/regions`.
+    into : Path
+        Folder of the results.
+    region : Path, optional
+        Folder of the map; by default the newest built one that holds the first position.
+    near : tuple of float, optional
+        Longitude and latitude of the middle of the search, in place of positions in the files.
+    radius_m : float
+        Of the disc that is searched.
+    heading : tuple of float, optional
+        Of the pictures' up, degrees clockwise from true north, and its standard deviation.
+    is_turned : bool
+        Whether any heading is possible, whatever the files say.
+    told : Told
+        Height or width of the ground.
+    matcher, segmenter : str
+        Names, or module:Class.
+    uses_position : bool
+        Whether positions in the files may be used; without, and without `near`, the whole map is searched.
+    most_false : float
+        P(false fix) up to which a fix is accepted.
+    """
+
+    pictures: Path
+    out: Path
+    into: Path
+    region: Path | None = None
+    near: tuple[float, float] | None = None
+    radius_m: float = RADIUS_M
+    heading: tuple[float, float] | None = None
+    is_turned: bool = False
+    told: Told = field(default_factory=Told)
+    matcher: str = MATCHER
+    segmenter: str = SEGMENTER
+    uses_position: bool = True
+    most_false: float = MOST_FALSE
+    limits: Limits = field(default_factory=Limits)
+    is_sandboxed: bool = True
+
+    def __post_init__(self) -> None:
+        if not 10.0 <= self.radius_m <= 100_000.0:
+            raise ConfigError(f"--radius lies within 10 and 100000 m, got {self.radius_m!r}")
+        if not 0 < self.most_false < 1:
+            raise ConfigError(f"--most-false lies between 0 and 1, got {self.most_false!r}")
+        if self.near is not None and not (abs(self.near[0]) <= 180 and abs(self.near[1]) <= 84):  # UTM ends there
+            raise ConfigError(f"--near is longitude,latitude, degrees, got {self.near[0]:g},{self.near[1]:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fix:
+    """Where one picture was taken, as far as that can be said; the columns of `locate.csv`, and what a page shows.
+
+    `lon`, `lat` and `x_m`, `y_m` (in the map's CRS) are the best place for the camera; `heading_deg` counts from true
+    north. They are there unless nothing was found at all, also where the fix is not accepted. `prior_*` is the disc
+    that was searched. `file_distance_m` is how far the best place is from the position that the file carries.
+    """
+
+    file: str
+    status: Found
+    lon: float | None = None
+    lat: float | None = None
+    x_m: float | None = None
+    y_m: float | None = None
+    heading_deg: float | None = None
+    p_false: float | None = None
+    is_accepted: bool = False
+    reason: str = ""
+    prior_lon: float | None = None
+    prior_lat: float | None = None
+    prior_radius_m: float | None = None
+    file_distance_m: float | None = None
+    seconds: float = 0.0
+    # What is not in the table:
+    side_m: float | None = None
+    height_m: float | None = None
+    taken_at: str | None = None
+    note: str = ""
+    view: tuple[float, float, float, float] | None = None  # easting, northing, yaw and scale of the view's middle
+
+    @property
+    def view_pose(self) -> Pose | None:
+        """Return the pose of the middle of what was seen, on the map's grid."""
+        if self.view is None:
+            return None
+        return Pose(easting_m=self.view[0], northing_m=self.view[1], yaw_deg=self.view[2], scale=self.view[3])
+
+
+COLUMNS: Final = (
+    *("file", "status", "lon", "lat", "x_m", "y_m", "heading_deg", "p_false", "is_accepted", "reason"),
+    *("prior_lon", "prior_lat", "prior_radius_m", "file_distance_m", "seconds"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """What a page shows of one picture beside its fix."""
+
+    fix: Fix
+    sight: Sight
+    segmentation: Segmentation
+    evidence: Evidence
+
+
+@dataclass(frozen=True, kw_only=True)
+class Located:
+    """All fixes of a request, in the order of the pictures; the map they are on, and how far P(false fix) holds."""
+
+    request: LocateRequest
+    region: Path
+    manifest: Manifest
+    fixes: tuple[Fix, ...]
+    calibration: str
+
+
+class Watch:
+    """Gets each picture when it is done; what it does not want costs nothing."""
+
+    def seen(self, number: int, seen: Seen) -> None:
+        """Take a picture with its evidence."""
+
+    def is_shown(self, number: int) -> bool:  # noqa: ARG002
+        """Return whether a picture was taken by an earlier call already."""
+        return True
+
+
+def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = None) -> Located:
+    """Locate pictures; goes on where an earlier call with the same words was cut off.
+
+    `watching` makes, for the folder of the map, what gets each picture when it is done.
+
+    Raises
+    ------
+    ConfigError
+        If a number is out of range, or no region holds the first picture.
+    ImageError
+        If there is no picture.
+    MatchError
+        If the matcher or the segmenter cannot be loaded, or needs what pictures do not give. One picture that cannot be
+        read costs itself alone: its row says why.
+    StoreError
+        If the region is missing or damaged.
+    """
+    paths = list_pictures(request.pictures)
+    names = names_of(paths, request.pictures)
+    region = request.region or _region_of(request, paths)
+    manifest = read_manifest(region)
+    watch = None if watching is None else watching(region)
+    request.into.mkdir(parents=True, exist_ok=True)
+    with locked(request.into), _Asker(request, region, manifest) as asker:
+        kept = _kept(request.into / ANSWERS)
+        fixes: list[Fix] = []
+        label = "pictures located"
+        progress.begin(label, len(paths))
+        with (request.into / ANSWERS).open("a", encoding="utf-8") as file:
+            for number, (path, name) in enumerate(zip(paths, names, strict=True)):
+                key = asker.key(path, name)
+                fix = kept.get(key)
+                if fix is None or (watch is not None and not watch.is_shown(number) and fix.view is not None):
+                    seen = asker.ask(path, name)
+                    fix = seen if isinstance(seen, Fix) else seen.fix
+                    if watch is not None and isinstance(seen, Seen):
+                        watch.seen(number, seen)
+                    if fix.status != "failed":
+                        file.write(json.dumps({"key": key, "fix": asdict(fix)}) + "\n")
+                        file.flush()
+                fixes.append(fix)
+                progress.advance(label, 1)
+        return Located(
+            request=request,
+            region=region,
+            manifest=manifest,
+            fixes=tuple(fixes),
+            calibration=asker.calibration,
+        )
+
+
+def _kept(path: Path) -> dict[str, Fix]:
+    """Return the fixes of earlier calls by key; a last line that was cut off counts as none."""
+    if not path.is_file():
+        return {}
+    found = {}
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            row = json.loads(line)
+            view = row["fix"].pop("view")
+            found[str(row["key"])] = Fix(**row["fix"], view=None if view is None else tuple(view))
+        except (ValueError, TypeError, KeyError, AttributeError):
+            continue
+    return found
+
+
+def _region_of(request: LocateRequest, paths: Sequence[Path]) -> Path:
+    """Return the newest built region that holds the place of the search, and say which."""
+    place, of = request.near, "--near"
+    if place is None and request.uses_position:
+        for path in paths:
+            try:
+                place, of = open_picture(path, request.told).lonlat, path.name
+            except SasgeoError:
+                continue
+            if place is not None:
+                break
+    if place is None:
+        raise ConfigError("no picture says where it was taken: name a region with --region, or a place with --near")
+    found = []
+    for file in sorted((request.out / "regions").glob("*/region.json")):
+        try:
+            manifest = read_manifest(file.parent)
+        except StoreError:
+            continue
+        if "+" not in file.parent.name and _holds(manifest, place):
+            found.append((manifest.extract.date, -math.prod(manifest.grid.shape), file.parent))
+    if not found:
+        raise ConfigError(
+            f"no built region in {request.out / 'regions'} holds {place[0]:.5f},{place[1]:.5f} ({of}): make one with "
+            f"new-region NAME --center {place[0]:.5f},{place[1]:.5f} --size 2km, and build it"
+        )
+    folder = max(found)[2]
+    tell(f"map: {folder.name}, the newest that holds {of}")
+    return folder
+
+
+def _holds(manifest: Manifest, place: tuple[float, float]) -> bool:
+    try:
+        east_m, north_m, _ = grid_place(*place, manifest.epsg)
+    except SasgeoError:
+        return False
+    west, south, east, north = manifest.bounds_m
+    return west <= east_m <= east and south <= north_m <= north
+
+
+class _Asker:
+    """The processes of a segmenter and a matcher, and all that a picture is asked with."""
+
+    def __init__(self, request: LocateRequest, region: Path, manifest: Manifest) -> None:
+        self._request, self._region, self._manifest = request, region, manifest
+        hidden = hidden_below([request.out.resolve()])
+        reach = Reach(
+            readable=(), hidden=[*hidden, request.out.resolve() / "regions"], is_sandboxed=request.is_sandboxed
+        )
+        self._segmenter = SegmenterProcess(spec=request.segmenter, reach=reach, limits=request.limits)
+        reach = Reach(readable=[region.resolve()], hidden=hidden, is_sandboxed=request.is_sandboxed)
+        self._worker = Worker(spec=request.matcher, reach=reach, limits=request.limits)
+        self._threads = ThreadPoolExecutor(3)
+        self._codes: Future[tuple[str, str]] = self._threads.submit(
+            lambda: (matcher_code(request.matcher), segmenter_code(request.segmenter))
+        )
+        self._matcher_card: Future[MatcherCard] = self._threads.submit(self._prepared)
+        self._segmenter_card: Future[SegmenterCard] = self._threads.submit(self._loaded)
+        self._chances: Chances | None = None
+        self._has_chances = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._threads.shutdown(wait=True, cancel_futures=True)
+        self._segmenter.end()
+        self._worker.end()
+
+    def _prepared(self) -> MatcherCard:
+        """Load the matcher and let it prepare the map."""
+        reply = self._worker.load()
+        if reply.card is None:
+            raise MatchError(f"{self._request.matcher}: cannot be loaded ({reply.message})")
+        if "training" in reply.card.needs:
+            raise MatchError(f"{reply.card.name} needs training, and nothing was learned here: name another --matcher")
+        ready = self._worker.prepare(self._region, None)
+        if ready.status != "ok":
+            raise MatchError(f"{reply.card.name} cannot prepare {self._region.name}: {ready.status}: {ready.message}")
+        return reply.card
+
+    def _loaded(self) -> SegmenterCard:
+        reply = self._segmenter.load()
+        if reply.card is None:
+            raise MatchError(f"{self._request.segmenter}: cannot be loaded ({reply.message})")
+        if "training" in reply.card.needs:
+            raise MatchError(f"{reply.card.name} needs training: name a --segmenter with weights, such as {SEGMENTER}")
+        return reply.card
+
+    @property
+    def chances(self) -> Chances | None:
+        """Return what P(false fix) is read off; None where nothing ships for this matcher and segmenter."""
+        if not self._has_chances:
+            answers = self._answers()
+            self._chances = None if answers is None else Chances.of(answers)
+            self._has_chances = True
+        return self._chances
+
+    def _answers(self) -> Answers | None:
+        card = self._matcher_card.result()
+        return answers_for(card.name, card.version, self._segmenter_card.result().name)
+
+    @property
+    def calibration(self) -> str:
+        """Return on which pictures P(false fix) was calibrated, in a line."""
+        answers = self._answers()
+        if answers is not None:
+            return f"P(false fix) is {answers.text}"
+        return (
+            f"P(false fix) is not calibrated for {self._request.matcher} with {self._request.segmenter}: nothing is "
+            "accepted"
+        )
+
+    def key(self, path: Path, name: str) -> str:
+        """Return the hash of all that an answer follows from."""
+        request = self._request
+        codes = self._codes.result()
+        stat = path.stat()
+        asked = [
+            _VERSION,
+            name,
+            stat.st_size,
+            stat.st_mtime_ns,
+            *codes,
+            {item: record.sha256 for item, record in self._manifest.files.items()},
+            request.near,
+            request.radius_m,
+            request.heading,
+            request.is_turned,
+            asdict(request.told),
+            request.uses_position,
+            request.most_false,
+        ]
+        return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:32]
+
+    def ask(self, path: Path, name: str) -> Seen | Fix:
+        """Locate one picture; a fault of the picture is a row."""
+        begun = time.perf_counter()
+        try:
+            picture = open_picture(path, self._request.told)
+            prior, centre = self._prior(picture, name)
+            sight = see(picture, self._request.told)
+        except SasgeoError as error:
+            return Fix(file=name, status="failed", reason=one_line(str(error)), seconds=_since(begun))
+        card = self._segmenter_card.result()
+        classes = card.classes
+        reply = guarded(lambda: self._segmenter.segment(sight.image, classes=classes), self._request.out, card.name)
+        if reply.found is None:
+            why = f"{card.name}: {reply.status}: {reply.message}"
+            return Fix(file=name, status="failed", reason=one_line(why), seconds=_since(begun))
+        query = self._query(picture, sight, reply.found, prior, name)
+        answer = self._answer(query)
+        fix = self._fix(picture, sight, query, answer, name, centre)
+        return Seen(
+            fix=replace(fix, seconds=_since(begun)), sight=sight, segmentation=reply.found, evidence=query.evidence
+        )
+
+    def _prior(self, picture: OwnPicture, name: str) -> tuple[Prior, tuple[float, float] | None]:
+        """Return what is known before, and longitude and latitude of the disc's middle."""
+        request, manifest = self._request, self._manifest
+        place = request.near or (picture.lonlat if request.uses_position else None)
+        centre_m = None
+        where = place or _middle(manifest)
+        east_m, north_m, convergence_deg = grid_place(*where, manifest.epsg)
+        if place is not None:
+            west, south, east, north = manifest.bounds_m
+            off_m = math.hypot(max(west - east_m, 0.0, east_m - east), max(south - north_m, 0.0, north_m - north))
+            if off_m > request.radius_m:
+                raise ConfigError(
+                    f"{name} was taken {off_m / 1000:.1f} km beside the map {self._region.name}: name another --region"
+                )
+            centre_m = (east_m, north_m)
+            if request.near is None:
+                # The position in the file is in the disc, and nowhere special: its middle would be the answer.
+                centre_m = _off_middle(centre_m, request.radius_m, name)
+        heading = request.heading
+        if heading is None and picture.heading_deg is not None and not request.is_turned:
+            sigma_deg = 5.0 if picture.heading_by == "georeference" else _GIMBAL_SIGMA_DEG
+            heading = (picture.heading_deg, sigma_deg)
+        prior = Prior(
+            center_m=centre_m,
+            radius_m=None if centre_m is None else request.radius_m,
+            yaw_deg=None if heading is None else round((heading[0] + convergence_deg) % 360.0, 1),
+            yaw_sigma_deg=None if heading is None else heading[1],
+            scale_sigma=picture.scale_sigma,
+        )
+        return prior, None if centre_m is None else self._lonlat(*centre_m)
+
+    def _lonlat(self, east_m: float, north_m: float) -> tuple[float, float]:
+        lon, lat = to_lonlat(self._manifest.epsg).transform(east_m, north_m)
+        return (float(lon), float(lat))
+
+    def _query(self, picture: OwnPicture, sight: Sight, seen: Segmentation, prior: Prior, name: str) -> Query:
+        frames: tuple[Frame, ...] = ()
+        if "image" in self._matcher_card.result().needs:
+            # The matcher finds the middle of the square, so the camera stands beside it in the frame of the view.
+            east_m, north_m = sight.middle_m
+            camera = sight.image.camera.moved(east_m=-east_m, north_m=-north_m)
+            frames = (Frame(picture=encode_webp(sight.image.rgb), camera=camera),)
+        size, cell_m = sight.size_cells, sight.cell_size_m
+        evidence = _evidence_of(sight, seen)
+        empty = Evidence(
+            classes=self._manifest.classes,
+            cells=np.full((len(self._manifest.classes), size, size), UNKNOWN, dtype=np.uint8),
+            cell_size_m=cell_m,
+        )
+        when = picture.taken_at.date() if picture.taken_at else self._manifest.extract.date
+        if prior.center_m is not None:
+            # The disc is of the camera, the view's middle lies beside it: as far as its heading tells, ahead.
+            yaw = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=prior.yaw_deg or 0.0)
+            shift = yaw.to_map(np.array([sight.middle_m]))[0] if prior.yaw_deg is not None else np.zeros(2)
+            middle_m = (float(prior.center_m[0] + shift[0]), float(prior.center_m[1] + shift[1]))
+            prior = replace(prior, center_m=middle_m)
+        return Query(
+            query_id=hashlib.sha256(name.encode()).hexdigest()[:24],
+            track="localization",
+            suite="locate",
+            suite_version=1,
+            part="test",
+            region=self._region.name,
+            prior_group="own",
+            evidence=for_classes(evidence, empty),
+            observed_on=when,
+            season="",
+            prior=prior,
+            frames=frames,
+        )
+
+    def _answer(self, query: Query) -> Prediction:
+        card = self._matcher_card.result()
+        reason = lacks(card, query)
+        if reason is not None:
+            return Prediction(query_id=query.query_id, status="not applicable", message=reason)
+        blob = query_bytes(query)
+        reply = guarded(lambda: self._worker.match(blob, top_k=_TOP_K), self._request.out, card.name)
+        if reply.found is None:
+            return Prediction(query_id=query.query_id, status=reply.status, message=reply.message)
+        return reply.found
+
+    def _fix(
+        self,
+        picture: OwnPicture,
+        sight: Sight,
+        query: Query,
+        answer: Prediction,
+        name: str,
+        centre: tuple[float, float] | None,
+    ) -> Fix:
+        known = Fix(
+            file=name,
+            status="withheld",
+            prior_lon=None if centre is None else round(centre[0], 7),
+            prior_lat=None if centre is None else round(centre[1], 7),
+            prior_radius_m=query.prior.radius_m,
+            side_m=round(sight.side_m, 1),
+            height_m=picture.height_m,
+            taken_at=picture.taken_at.isoformat() if picture.taken_at else None,
+            note="; ".join(filter(None, [picture.note, self._unlike(picture, sight, query.prior)])),
+        )
+        if answer.status != "ok":
+            why = one_line(f"{self._request.matcher}: {answer.status}: {answer.message}")
+            return replace(known, status="failed", reason=why)
+        if not answer.candidates:
+            return replace(known, reason="nothing that the map knows is seen", p_false=1.0)
+        view = answer.candidates[0][0]
+        stood = sight.camera_pose(view)
+        lon, lat = self._lonlat(stood.easting_m, stood.northing_m)
+        _, _, convergence_deg = grid_place(lon, lat, self._manifest.epsg)
+        away_m = None
+        if picture.lonlat is not None:
+            east_m, north_m, _ = grid_place(*picture.lonlat, self._manifest.epsg)
+            away_m = round(math.hypot(stood.easting_m - east_m, stood.northing_m - north_m), 2)
+        p_false = None if self.chances is None else round(self.chances.p_false(answer), 4)
+        status, reason = self._verdict(answer, p_false, query.prior)
+        return replace(
+            known,
+            status=status,
+            lon=round(lon, 7),
+            lat=round(lat, 7),
+            x_m=round(stood.easting_m, 2),
+            y_m=round(stood.northing_m, 2),
+            heading_deg=round((stood.yaw_deg - convergence_deg) % 360.0, 2),
+            p_false=p_false,
+            is_accepted=status == "found",
+            reason=reason,
+            file_distance_m=away_m,
+            view=(round(view.easting_m, 3), round(view.northing_m, 3), round(view.yaw_deg, 3), round(view.scale, 5)),
+        )
+
+    def _verdict(self, answer: Prediction, p_false: float | None, prior: Prior) -> tuple[Found, str]:
+        if p_false is None:
+            return "withheld", "P(false fix) is not calibrated for this matcher and segmenter"
+        if p_false <= self._request.most_false:
+            return "found", ""
+        where = "on the map" if prior.radius_m is None else f"within {prior.radius_m:g} m"
+        if p_false >= NOWHERE:
+            return "not on this map", f"no place {where} explains what is seen"
+        rivals = round(answer.diagnostics.get("modes_above", 1.0)) - 1
+        alike = f"{counted(rivals, 'other place')} {where} {'looks' if rivals == 1 else 'look'} alike"
+        weak = f"P(false fix) is above {self._request.most_false:g}"
+        return "withheld", alike if rivals > 0 else weak
+
+    def _unlike(self, picture: OwnPicture, sight: Sight, prior: Prior) -> str:
+        """Return in what a picture differs from those that P(false fix) was calibrated on; empty where in nothing."""
+        chances = self.chances
+        if chances is None:
+            return ""
+        known = chances.answers
+        least_m, most_m = known.sides_m
+        gsd_m = sight.side_m / min(sight.image.shape) if sight.image.shape else 0.0
+        faults = [
+            (not least_m <= sight.side_m <= most_m, f"a view of {sight.side_m:.0f} m, not {least_m:g} to {most_m:g}"),
+            (gsd_m > 1.2 * known.most_gsd_m, f"pixels of {gsd_m:.1f} m, more than {known.most_gsd_m:.1f}"),
+            (prior.radius_m is None, "a whole map searched"),
+            ((prior.radius_m or 0) > known.most_radius_m, f"a disc of more than {known.most_radius_m:g} m"),
+            (prior.yaw_deg is None, "an unknown heading"),
+            ((prior.yaw_sigma_deg or 0) > known.most_yaw_sigma_deg, "a vague heading"),
+            (prior.scale_sigma > known.most_scale_sigma, f"a size known to {100 * prior.scale_sigma:.0f} % only"),
+            (picture.tilt_deg > 10, f"a camera tilted by {picture.tilt_deg:.0f} degrees"),
+        ]
+        found = [words for is_fault, words in faults if is_fault]
+        return f"not calibrated on pictures like yours: {', '.join(found)}" if found else ""
+
+
+def _evidence_of(sight: Sight, seen: Segmentation) -> Evidence:
+    return to_evidence(
+        seen,
+        sight.image.camera,
+        Plane(),
+        size_cells=sight.size_cells,
+        cell_size_m=sight.cell_size_m,
+        pose=sight.pose,
+    )
+
+
+def _middle(manifest: Manifest) -> tuple[float, float]:
+    west, south, east, north = manifest.bounds_m
+    lon, lat = to_lonlat(manifest.epsg).transform((west + east) / 2, (south + north) / 2)
+    return (float(lon), float(lat))
+
+
+def _off_middle(at_m: tuple[float, float], radius_m: float, name: str) -> tuple[float, float]:
+    """Return the middle of a disc that holds a place anywhere; the same for the same name."""
+    seed = int.from_bytes(hashlib.sha256(f"{name} {radius_m:g}".encode()).digest()[:8], "big")
+    rng = np.random.default_rng(seed)
+    turn, far_m = rng.uniform(0, 2 * math.pi), (radius_m - 1.0) * math.sqrt(rng.random())
+    return (round(at_m[0] + far_m * math.cos(turn), 1), round(at_m[1] + far_m * math.sin(turn), 1))
+
+
+def _since(begun: float) -> float:
+    return round(time.perf_counter() - begun, 2)

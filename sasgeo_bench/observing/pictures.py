@@ -1,0 +1,489 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A picture of a user's own: a drone's photo, a georeferenced one, or any other whose size on the ground is known."""
+
+import datetime as dt
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Self
+
+import cv2
+import numpy as np
+import rasterio
+import shapely
+from affine import Affine
+from numpy.typing import NDArray
+from pyproj import Transformer
+from pyproj.exceptions import ProjError
+from rasterio.enums import ColorInterp, Resampling
+from rasterio.errors import CRSError, RasterioError
+from rasterio.vrt import WarpedVRT
+
+from sasgeo_bench.core.errors import CameraError, GridError, ImageError, SasgeoError
+from sasgeo_bench.core.geotiff import open_geotiff
+from sasgeo_bench.core.paths import read_bounded
+from sasgeo_bench.geometry.grid import utm_epsg
+from sasgeo_bench.geometry.pose import Pose, bearing_deg, rotation
+from sasgeo_bench.geometry.projection import from_lonlat
+from sasgeo_bench.regions.layers import find_bands, selected
+from sasgeo_bench.sensing.camera import Attitude, Camera
+from sasgeo_bench.sensing.ground import Plane
+from sasgeo_bench.sensing.image import AerialImage, decode_image
+from sasgeo_bench.sensing.photos import Photo, read_photo
+
+WIDEST_M: Final = 384.0  # side of a view: the largest that was measured
+LEAST_M: Final = 16.0  # of a smaller view nothing can be said
+FINEST_M: Final = 0.25  # pixels on the ground; finer ones are averaged
+STEEPEST_DEG: Final = 60.0  # of tilt: beyond it the ground of a view is far and coarse
+SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+MOST_BYTES: Final = 2**30  # of a georeferenced picture: windows of it are read
+_MOST_PHOTO_BYTES: Final = 64 * 2**20
+_FINE_M: Final = 128.0  # widest view in cells of `_CELLS_M[0]`, as in the suites
+_CELLS_M: Final = (0.5, 1.0)
+_MARGIN: Final = 1.25  # times the view's side is what is cut out of a picture
+_MERIDIAN_DEG: Final = 9.0
+_STRAIGHT: Final = "taken as seen from straight above"
+_STEPS: Final = 41  # places along the axis of a tilted camera, where its view may lie
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What a user says of pictures, in place of what their files say or lack; None where he says nothing.
+
+    `height_m` is the height above the ground, `ground_width_m` how wide the ground in the picture is.
+    """
+
+    height_m: float | None = None
+    ground_width_m: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, most in (("height_m", 10_000.0), ("ground_width_m", 100_000.0)):
+            value = getattr(self, name)
+            if value is not None and not 0 < value <= most:
+                raise CameraError(f"{name.replace('_', ' ')[:-2]} is above 0 and at most {most:g} m, got {value!r}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnPicture:
+    """What is known of a picture before its pixels are read.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file.
+    lonlat : tuple of float, optional
+        Where the camera stood (of a georeferenced picture: its middle), WGS 84, degrees; None where the file says none.
+    position_by : str
+        "EXIF" or "georeference"; empty without a position.
+    heading_deg : float, optional
+        Of the picture's up, degrees clockwise from true north; None where the file says none.
+    heading_by : str
+        "gimbal" or "georeference"; empty without one.
+    scale_sigma : float
+        Standard deviation of the size on the ground, as a fraction.
+    taken_at : datetime, optional
+        By the camera's clock.
+    camera : Camera, optional
+        Above the origin, the picture's up being north; of a photo.
+    gsd_m : float, optional
+        Width of a pixel on the ground, of a georeferenced picture.
+    height_m : float, optional
+        Of a photo, above the ground as it is believed.
+    note : str
+        What was taken for granted, in a few words.
+    """
+
+    path: Path
+    lonlat: tuple[float, float] | None = None
+    position_by: str = ""
+    heading_deg: float | None = None
+    heading_by: str = ""
+    scale_sigma: float
+    taken_at: dt.datetime | None = None
+    camera: Camera | None = None
+    gsd_m: float | None = None
+    height_m: float | None = None
+    note: str = ""
+
+    @property
+    def tilt_deg(self) -> float:
+        """Return the angle of the camera from straight down, degrees; 0 of a georeferenced picture."""
+        return 0.0 if self.camera is None else self.camera.tilt_deg
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sight:
+    """What a picture shows of the ground: a square, heading up, and the picture that it is seen in.
+
+    `image` stands above the origin, its up is north. `middle_m` is where the middle of the square lies, (right, up) of
+    the point beneath the camera, metres; `side_m` how long its sides are.
+    """
+
+    image: AerialImage
+    middle_m: tuple[float, float]
+    side_m: float
+
+    @property
+    def cell_size_m(self) -> float:
+        """Return the side of a cell of the view, metres, as the suites have it."""
+        return _CELLS_M[self.side_m > _FINE_M]
+
+    @property
+    def size_cells(self) -> int:
+        """Return the cells along a side."""
+        return max(2, int(self.side_m / self.cell_size_m))
+
+    @property
+    def pose(self) -> Pose:
+        """Return where the square lies in the frame of the image."""
+        return Pose(easting_m=self.middle_m[0], northing_m=self.middle_m[1], yaw_deg=0.0)
+
+    def camera_pose(self, view: Pose) -> Pose:
+        """Return where the camera stands if the square lies at a pose of a map; it heads as the square does.
+
+        >>> image = AerialImage.from_above(np.zeros((8, 8, 3), dtype=np.uint8), gsd_m=1.0)
+        >>> ahead = Sight(image=image, middle_m=(0.0, 30.0), side_m=8.0)
+        >>> stood = ahead.camera_pose(Pose(easting_m=100.0, northing_m=0.0, yaw_deg=90.0))
+        >>> round(stood.easting_m), round(stood.northing_m)
+        (70, 0)
+        """
+        east_m, north_m = view.to_map(-np.array([self.middle_m]))[0].tolist()
+        return replace(view, easting_m=east_m, northing_m=north_m)
+
+    def view_pose(self, camera: Pose) -> Pose:
+        """Return where the square lies if the camera stands at a pose of a map; the inverse of `camera_pose`."""
+        east_m, north_m = camera.to_map(np.array([self.middle_m]))[0].tolist()
+        return replace(camera, easting_m=east_m, northing_m=north_m)
+
+
+def list_pictures(path: Path) -> list[Path]:
+    """Return the pictures of a folder and of those below it, sorted by path, or the one file that is named.
+
+    Raise `ImageError` if there is none, or it is an archive.
+    """
+    if path.is_dir():
+        found = sorted(one for one in path.rglob("*") if one.suffix.lower() in SUFFIXES and one.is_file())
+        found = [one for one in found if not any(part.startswith(".") for part in one.relative_to(path).parts)]
+        if not found:
+            raise ImageError(f"{path} holds no picture ({', '.join(SUFFIXES)}): name a folder that does")
+        return found
+    if not path.is_file():
+        raise ImageError(f"there is no picture or folder {path}: check the path")
+    if path.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"):
+        raise ImageError(f"{path} is an archive: unpack it and name the folder")
+    return [path]
+
+
+def open_picture(path: Path, told: Told | None = None) -> OwnPicture:
+    """Read what a file, or the user in its place, says of a picture; no pixel is decoded.
+
+    Raises
+    ------
+    ImageError
+        If the file is no picture, or damaged.
+    CameraError
+        If its size on the ground is not known, or the camera does not look at the ground.
+
+    Examples
+    --------
+    >>> open_picture(Path("garden.jpg"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.core.errors.ImageError: there is no photo garden.jpg: check the path
+    """
+    told = told or Told()
+    if path.suffix.lower() in (".tif", ".tiff") and (found := _georeferenced(path)) is not None:
+        return found
+    if path.suffix.lower() in (".png", ".webp"):  # without metadata of a drone that anybody writes
+        return _plain(path, told)
+    return _of_photo(path, read_photo(path, most_bytes=_MOST_PHOTO_BYTES), told)
+
+
+def _plain(path: Path, told: Told) -> OwnPicture:
+    if told.ground_width_m is None:
+        raise CameraError(f"{path.name} does not say how large its ground is: say --ground-width in metres")
+    return OwnPicture(path=path, scale_sigma=0.03, note=_STRAIGHT)
+
+
+def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
+    if photo.gimbal_fault:
+        raise CameraError(f"{path.name} has {photo.gimbal_fault}: use the drone's own file")
+    lonlat = None if photo.lon_deg is None or photo.lat_deg is None else (photo.lon_deg, photo.lat_deg)
+    known = OwnPicture(
+        path=path,
+        lonlat=lonlat,
+        position_by="EXIF" if lonlat else "",
+        scale_sigma=0.03,
+        taken_at=photo.taken_at,
+        note="" if photo.gimbal else _STRAIGHT,
+    )
+    if told.ground_width_m is not None:
+        if photo.gimbal is None:
+            return known
+        raise CameraError(f"{path.name} says how its camera stood: say --height in place of --ground-width")
+    height_m = photo.height_m if told.height_m is None else told.height_m
+    if height_m is None:
+        raise CameraError(
+            f"{path.name} does not say how high the drone was: say --height in metres above the ground, or "
+            "--ground-width"
+        )
+    if not height_m > 0:
+        raise CameraError(f"{path.name} was taken {height_m:+g} m above take-off: say --height above the ground")
+    try:
+        lens = photo.intrinsics()
+    except CameraError as error:
+        raise CameraError(f"{error}; or say --ground-width") from error
+    gimbal = photo.gimbal or Attitude(pitch_deg=-90.0)
+    # Anywhere on the central meridian of a zone, where north is that of the grid: headings stay against true north.
+    placed = replace(photo, lon_deg=_MERIDIAN_DEG, lat_deg=0.0, gimbal=gimbal)
+    sensor = placed.camera(height_m=height_m, intrinsics=lens)
+    if sensor.tilt_deg > STEEPEST_DEG:
+        raise CameraError(
+            f"{path.name} looks {sensor.tilt_deg:.0f} degrees away from straight down, at most {STEEPEST_DEG:g} are "
+            "read: leave it out"
+        )
+    by = "gimbal" if photo.gimbal else ""
+    return replace(
+        known,
+        heading_deg=sensor.yaw_deg if by else None,
+        heading_by=by,
+        scale_sigma=0.10,
+        camera=_north_up(sensor),
+        height_m=height_m,
+    )
+
+
+def _north_up(camera: Camera) -> Camera:
+    """Return a camera above the origin, in axes in which its picture's up is north."""
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(camera.yaw_deg)
+    a, b, c, d, e, f, g, h, i = (camera.matrix @ turn).ravel().round(15).tolist()
+    return replace(camera, east_m=0.0, north_m=0.0, rotation=(a, b, c, d, e, f, g, h, i))
+
+
+def _georeferenced(path: Path) -> OwnPicture | None:
+    """Return a picture with a place on earth; None if the file says none."""
+    try:
+        with open_geotiff(path) as source:
+            if source.crs is None or source.transform.is_identity:
+                return None
+            ground = _Ground.of(source)
+    except RasterioError as error:
+        if isinstance(error, CRSError):
+            raise ImageError(f"{path} has a coordinate system that is not known ({error}): warp it") from error
+        return None  # no TIFF that GDAL reads: a photo, or damaged, which is refused as such
+    except (ProjError, GridError) as error:
+        raise ImageError(f"{path} lies nowhere on earth ({error}): check its georeference") from error
+    return OwnPicture(
+        path=path,
+        lonlat=ground.lonlat,
+        position_by="georeference",
+        heading_deg=ground.true_heading_deg,
+        heading_by="georeference",
+        scale_sigma=0.03,
+        gsd_m=ground.gsd_m,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Ground:
+    """The middle of a georeferenced picture: where, how large its pixels are, and which way up is, in a UTM zone."""
+
+    epsg: int
+    lonlat: tuple[float, float]
+    middle_m: tuple[float, float]
+    gsd_m: float
+    heading_deg: float  # of the picture's up in the grid
+    true_heading_deg: float
+    size_m: tuple[float, float]
+
+    @classmethod
+    def of(cls, source: rasterio.io.DatasetReader) -> Self:
+        to_lonlat = Transformer.from_crs(source.crs.to_wkt(), 4326, always_xy=True)
+        col, row = source.width / 2, source.height / 2
+        x, y = source.transform @ (col, row)
+        lon_deg, lat_deg = to_lonlat.transform(x, y, errcheck=True)
+        epsg = utm_epsg(lon_deg, lat_deg)
+        to_grid = Transformer.from_crs(source.crs.to_wkt(), epsg, always_xy=True)
+        # Over many pixels: of one, rounding would show.
+        cols = np.array([col, 0, source.width, col, col])
+        rows = np.array([row, row, row, 0, source.height])
+        xs, ys = source.transform @ (cols, rows)
+        east, north = to_grid.transform(xs, ys, errcheck=True)
+        across, up = (east[2] - east[1], north[2] - north[1]), (east[3] - east[4], north[3] - north[4])
+        width_m, height_m = math.hypot(*across), math.hypot(*up)
+        gsd_m = math.sqrt(abs(across[0] * up[1] - across[1] * up[0]) / (source.width * source.height))
+        if not (math.isfinite(gsd_m) and gsd_m > 0):
+            raise GridError(f"pixels of {gsd_m!r} m")
+        heading_deg = float(bearing_deg(*up))
+        _, _, convergence_deg = grid_place(lon_deg, lat_deg, epsg)
+        return cls(
+            epsg=epsg,
+            lonlat=(lon_deg, lat_deg),
+            middle_m=(float(east[0]), float(north[0])),
+            gsd_m=gsd_m,
+            heading_deg=heading_deg,
+            true_heading_deg=(heading_deg - convergence_deg) % 360.0,
+            size_m=(width_m, height_m),
+        )
+
+
+def grid_place(lon_deg: float, lat_deg: float, epsg: int) -> tuple[float, float, float]:
+    """Return easting and northing, metres, and the bearing of true north in the grid, degrees."""
+    step_deg = 1e-4 if lat_deg < 0 else -1e-4  # never over a pole
+    east_m, north_m = from_lonlat(epsg).transform([lon_deg, lon_deg], [lat_deg, lat_deg + step_deg])
+    sign = math.copysign(1.0, step_deg)
+    bearing = float(bearing_deg(sign * (east_m[1] - east_m[0]), sign * (north_m[1] - north_m[0])))
+    return float(east_m[0]), float(north_m[0]), bearing
+
+
+def see(picture: OwnPicture, told: Told | None = None) -> Sight:
+    """Decode a picture, or the part of it that a view needs.
+
+    Raises
+    ------
+    ImageError
+        If its pixels are damaged, or too many.
+    CameraError
+        If it shows less ground than `LEAST_M` a side.
+    """
+    told = told or Told()
+    if picture.camera is None and picture.position_by == "georeference":
+        return _seen_from_above(*_read_georeferenced(picture))
+    name = picture.path.name
+    rgb = decode_image(read_bounded(picture.path, _MOST_PHOTO_BYTES), name=name)
+    if picture.camera is None:
+        assert told.ground_width_m is not None  # noqa: S101 - by `open_picture`
+        gsd_m = told.ground_width_m / rgb.shape[1]
+        if gsd_m > 5.0:  # metres: no house would be seen
+            raise CameraError(
+                f"{name} would have pixels of {gsd_m:.1f} m by --ground-width, at most 5 show a map's things"
+            )
+        return _seen_from_above(rgb, gsd_m, name)
+    lens = picture.camera.intrinsics
+    if rgb.shape[:2] != (lens.height_px, lens.width_px):
+        raise ImageError(
+            f"{name} has {rgb.shape[1]} x {rgb.shape[0]} pixels, its head says another size: copy it again"
+        )
+    return _seen_by(AerialImage(rgb=rgb, camera=picture.camera), name)
+
+
+def _seen_from_above(rgb: NDArray[np.uint8], gsd_m: float, name: str) -> Sight:
+    return _seen_by(AerialImage.from_above(rgb, gsd_m=gsd_m), name)
+
+
+def _seen_by(image: AerialImage, name: str) -> Sight:
+    footprint = image.camera.footprint(Plane())
+    middle_m, side_m = largest_square(footprint)
+    if side_m < LEAST_M:
+        raise CameraError(
+            f"{name} shows a square of {side_m:.0f} m, a view has at least {LEAST_M:g} m: check the height, or "
+            "leave it out"
+        )
+    return Sight(image=_fitting(image, middle_m, side_m), middle_m=middle_m, side_m=side_m)
+
+
+def largest_square(footprint: shapely.Polygon, *, most_m: float = WIDEST_M) -> tuple[tuple[float, float], float]:
+    """Return middle and side of the largest north-up square in a footprint that is as long as `most_m` at most.
+
+    Its middle lies on the line north of the footprint's; of several, the nearest to the origin is taken, where pixels
+    are finest.
+
+    >>> largest_square(shapely.box(-30, -20, 30, 20))
+    ((0.0, 0.0), 40.0)
+    """
+    if footprint.is_empty:
+        return (0.0, 0.0), 0.0
+    west, south, east, north = footprint.bounds
+    shapely.prepare(footprint)
+    found = ((0.0, 0.0), 0.0)
+    for y in sorted(np.linspace(south, north, _STEPS).tolist(), key=abs):
+        line = footprint.intersection(shapely.LineString([(west, y), (east, y)]))
+        if line.is_empty:
+            continue
+        x = line.centroid.x
+        low, high = 0.0, min(most_m, 2 * (north - south), 2 * (east - west))
+        for _ in range(20):  # halvings: to a millimetre
+            side = (low + high) / 2
+            half = side / 2 - 1e-6
+            is_in = half <= 0 or footprint.covers(shapely.box(x - half, y - half, x + half, y + half))
+            low, high = (side, high) if is_in else (low, side)
+        if low > found[1] + 0.01:  # a centimetre
+            found = ((x, y), low)
+    (x, y), side = found
+    return (round(x, 3), round(y, 3)), round(side, 2)
+
+
+def _fitting(image: AerialImage, middle_m: tuple[float, float], side_m: float) -> AerialImage:
+    """Return the part of a picture around a view, with pixels no finer than a segmenter needs."""
+    reach = side_m / 2 * _MARGIN
+    steps = np.linspace(-reach, reach, 9)
+    en_m = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + middle_m
+    points = image.camera.project(np.column_stack([en_m, np.zeros(len(en_m))]))
+    points = points[np.isfinite(points).all(axis=1)]
+    rows, cols = image.shape
+    left, top = np.floor(points.min(axis=0)).clip(0).astype(int).tolist()
+    right, bottom = np.minimum(np.ceil(points.max(axis=0)).astype(int), (cols, rows)).tolist()
+    part = image.cropped(top, left, bottom - top, right - left)
+    gsd_m = side_m / max(1.0, float(np.ptp(points, axis=0).min()) / _MARGIN)
+    factor = int(FINEST_M / gsd_m)
+    return part if factor < 2 else _averaged(part, factor)
+
+
+def _averaged(image: AerialImage, factor: int) -> AerialImage:
+    """Return a picture with pixels so many times as wide; rows and columns that fill no whole pixel are left out."""
+    rows, cols = (side // factor for side in image.shape)
+    rgb = cv2.resize(image.rgb[: rows * factor, : cols * factor], (cols, rows), interpolation=cv2.INTER_AREA)
+    lens = image.camera.intrinsics
+    (focal_x, focal_y), (centre_x, centre_y) = lens.focal_px, lens.centre_px
+    small = replace(
+        lens,
+        width_px=cols,
+        height_px=rows,
+        focal_px=(focal_x / factor, focal_y / factor),
+        centre_px=(centre_x / factor, centre_y / factor),
+    )
+    return replace(image, rgb=np.ascontiguousarray(rgb), camera=replace(image.camera, intrinsics=small))
+
+
+def _read_georeferenced(picture: OwnPicture) -> tuple[NDArray[np.uint8], float, str]:
+    """Read the middle of a georeferenced picture in its own axes: what a view needs; black where it is empty."""
+    path = picture.path
+    try:
+        with open_geotiff(path, has_more=True) as source:
+            ground = _Ground.of(source)
+            bands = find_bands(path, source)
+            gsd_m = max(ground.gsd_m, FINEST_M)
+            cols, rows = (max(2, round(min(side, WIDEST_M * _MARGIN) / gsd_m)) for side in ground.size_m)
+            turned = Affine.translation(*ground.middle_m) @ Affine.rotation(-ground.heading_deg)
+            transform = turned @ Affine.scale(gsd_m, -gsd_m) @ Affine.translation(-cols / 2, -rows / 2)
+            view = selected(source, bands)
+            with (
+                rasterio.open(view, driver="VRT") if view else source as shown,
+                WarpedVRT(
+                    shown,
+                    crs=f"EPSG:{ground.epsg}",
+                    transform=transform,
+                    height=rows,
+                    width=cols,
+                    resampling=Resampling.average if gsd_m > 1.5 * ground.gsd_m else Resampling.cubic,
+                    add_alpha=ColorInterp.alpha not in shown.colorinterp,
+                    init_dest_nodata=False,
+                ) as warped,
+            ):
+                alpha = warped.colorinterp.index(ColorInterp.alpha) + 1
+                found = warped.read((1, 2, 3, alpha))
+    except (RasterioError, OSError) as error:
+        if isinstance(error, SasgeoError):
+            raise
+        raise ImageError(f"{path} is damaged ({str(error)[:200]}): get it again") from error
+    rgb = np.where(found[3] > 0, found[:3], 0).astype(np.uint8)
+    if not (found[3] > 0).any():
+        raise ImageError(f"{path} shows nothing around its middle: name a part of it that does")
+    return np.ascontiguousarray(np.moveaxis(rgb, 0, -1)), gsd_m, path.name
+
+
+def names_of(paths: Sequence[Path], root: Path) -> list[str]:
+    """Return the names by which pictures are known: relative to the folder that was named."""
+    return [path.relative_to(root).as_posix() if root.is_dir() else path.name for path in paths]

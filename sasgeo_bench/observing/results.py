@@ -1,0 +1,333 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `locate` leaves behind: a table, files for maps and flights, and one page to look at."""
+
+import base64
+import csv
+import datetime as dt
+import html
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from io import BytesIO, StringIO
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree as ET
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sasgeo_bench.core.errors import counted
+from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.texts import csv_cell, plain
+from sasgeo_bench.observing.locate import COLUMNS, Fix, Located, Seen, Watch
+from sasgeo_bench.observing.pictures import grid_place
+from sasgeo_bench.regions.evidence import LayerBits, observe
+from sasgeo_bench.regions.preview import paint_overview, pooled
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.sensing.birdseye import rectify
+from sasgeo_bench.sensing.ground import Plane
+from sasgeo_bench.tasks.segmented import Segmented
+from sasgeo_bench.tasks.sheet import paint
+
+TABLE: Final = "locate.csv"
+PAGE: Final = "index.html"
+STRIPS: Final = "pictures"
+MOST_SHOWN: Final = 300  # pictures on a page
+_PANEL_PX: Final = 240
+_MAP_PX: Final = 1000
+_MEND: Final = "name another folder by --into, or check your rights and the free space"
+
+
+class Strips(Watch):
+    """Draws each picture beside its evidence and the map at its fix, into files of a page."""
+
+    def __init__(self, folder: Path, region: Callable[[], Region]) -> None:
+        self._folder, self._open = folder / STRIPS, region
+        self._map: tuple[Region, LayerBits] | None = None
+
+    def is_shown(self, number: int) -> bool:
+        """Return whether the strip of a picture is there, or none is wanted."""
+        return number >= MOST_SHOWN or strip_file(self._folder, number).is_file()
+
+    def seen(self, number: int, seen: Seen) -> None:
+        """Draw the strip of a picture."""
+        if number >= MOST_SHOWN:
+            return
+        if self._map is None:
+            region = self._open()
+            self._map = (region, LayerBits.of(region.layers))
+        panels = strip(seen, *self._map)
+        path = strip_file(self._folder, number)
+        with fresh_file(path, mend=_MEND) as scratch:
+            Image.fromarray(panels).save(scratch, format="WEBP", quality=80)
+
+
+def strip_file(folder: Path, number: int) -> Path:
+    """Return the file of a strip."""
+    return folder / f"{number:04d}.webp"
+
+
+def strip(seen: Seen, region: Region, layers: LayerBits) -> NDArray[np.uint8]:
+    """Return the picture, what the segmenter saw, the evidence and the map at the fix, side by side, heading up."""
+    sight, evidence = seen.sight, seen.evidence
+    lattice = {"size_cells": sight.size_cells, "cell_size_m": sight.cell_size_m, "pose": sight.pose}
+    over = Segmented.of(seen.segmentation).over(sight.image.rgb)
+    panels = [rectify(picture, sight.image.camera, Plane(), **lattice) for picture in (sight.image.rgb, over)]  # type: ignore[arg-type]
+    panels.append(_bytes(paint(evidence)))
+    pose = seen.fix.view_pose
+    if pose is None:
+        panels.append(np.full_like(panels[0], 235))
+    else:
+        cells = observe(layers, region.grid, pose, size_cells=sight.size_cells, cell_size_m=sight.cell_size_m)
+        order = [region.classes.index(name) for name in evidence.classes]
+        panels.append(_bytes(paint(evidence.replace(cells[order]))))
+    gap = np.full((_PANEL_PX, 6, 3), 255, dtype=np.uint8)
+    fitted = [cv2.resize(one, (_PANEL_PX, _PANEL_PX), interpolation=cv2.INTER_AREA) for one in panels]
+    return np.concatenate([part for one in fitted for part in (one, gap)][:-1], axis=1)
+
+
+def _bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.asarray(np.rint(255 * colours), dtype=np.uint8)
+
+
+def write_results(located: Located, region: Region) -> list[Path]:
+    """Write table, GeoJSON, GPX, KML, TUM and page into the folder of the request; return their paths.
+
+    GPX, KML and TUM hold accepted fixes alone, the others all. Raise `StoreError` if one cannot be written.
+    """
+    folder, fixes = located.request.into, located.fixes
+    credit = located.manifest.attribution
+    texts = {
+        TABLE: csv_text(fixes),
+        "locate.geojson": geojson_text(fixes, credit),
+        "locate.gpx": gpx_text(fixes, credit),
+        "locate.kml": kml_text(fixes, credit),
+        "locate.tum": tum_text(fixes),
+        PAGE: page_text(located, region),
+    }
+    for name, text in texts.items():
+        with fresh_file(folder / name, mend=_MEND) as scratch:
+            scratch.write_text(text, encoding="utf-8")
+    return [folder / name for name in texts]
+
+
+def csv_text(fixes: Sequence[Fix]) -> str:
+    """Return the table; columns as `Fix` describes them, empty where nothing is known.
+
+    >>> print(csv_text([Fix(file="a.jpg", status="failed", reason="=1+1")]).splitlines()[1])
+    a.jpg,failed,,,,,,,false,'=1+1,,,,,0.0
+    """
+    rows: list[tuple[object, ...]] = [COLUMNS]
+    for fix in fixes:
+        values = asdict(fix) | {"is_accepted": str(fix.is_accepted).lower()}
+        rows.append(tuple("" if values[name] is None else csv_cell(values[name]) for name in COLUMNS))
+    text = StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def geojson_text(fixes: Sequence[Fix], credit: str) -> str:
+    """Return all places as GeoJSON (RFC 7946), the columns of the table being properties."""
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [fix.lon, fix.lat]},
+            "properties": {name: getattr(fix, name) for name in COLUMNS if name not in ("lon", "lat")},
+        }
+        for fix in fixes
+        if fix.lon is not None
+    ]
+    return json.dumps({"type": "FeatureCollection", "attribution": credit, "features": features}, indent=1) + "\n"
+
+
+def gpx_text(fixes: Sequence[Fix], credit: str) -> str:
+    """Return accepted fixes as waypoints of GPX 1.1."""
+    root = ET.Element("gpx", version="1.1", creator="sasgeo-bench", xmlns="http://www.topografix.com/GPX/1/1")
+    ET.SubElement(ET.SubElement(root, "metadata"), "desc").text = plain(f"map data: {credit}")
+    for fix in _accepted(fixes):
+        point = ET.SubElement(root, "wpt", lat=f"{fix.lat:.7f}", lon=f"{fix.lon:.7f}")
+        if fix.taken_at is not None:
+            # GPX asks for UTC; the camera's clock says no zone, so the time stands in the description.
+            ET.SubElement(point, "cmt").text = plain(f"taken at {fix.taken_at} by the camera's clock")
+        ET.SubElement(point, "name").text = plain(fix.file)
+        ET.SubElement(point, "desc").text = _words(fix)
+    return _xml(root)
+
+
+def kml_text(fixes: Sequence[Fix], credit: str) -> str:
+    """Return accepted fixes as placemarks of KML 2.2, clamped to the ground."""
+    root = ET.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
+    document = ET.SubElement(root, "Document")
+    ET.SubElement(document, "description").text = plain(f"map data: {credit}")
+    for fix in _accepted(fixes):
+        mark = ET.SubElement(document, "Placemark")
+        ET.SubElement(mark, "name").text = plain(fix.file)
+        ET.SubElement(mark, "description").text = _words(fix)
+        point = ET.SubElement(mark, "Point")
+        ET.SubElement(point, "altitudeMode").text = "clampToGround"
+        ET.SubElement(point, "coordinates").text = f"{fix.lon:.7f},{fix.lat:.7f}"
+    return _xml(root)
+
+
+def tum_text(fixes: Sequence[Fix]) -> str:
+    """Return accepted fixes as a TUM trajectory: time, x, y, z and the quaternion x, y, z, w of the heading.
+
+    Time is that of the camera's clock, seconds as if it were UTC; x and y are metres of the map's grid, z the height
+    above the ground as believed. The body's x points ahead: a heading of north is a turn by 90 degrees from east.
+    """
+    lines = ["# time x y z qx qy qz qw"]
+    for fix in _accepted(fixes):
+        if fix.taken_at is None or fix.view is None:
+            continue
+        seconds = dt.datetime.fromisoformat(fix.taken_at).replace(tzinfo=dt.UTC).timestamp()
+        half = math.radians(90.0 - fix.view[2]) / 2
+        lines.append(
+            f"{seconds:.3f} {fix.x_m:.3f} {fix.y_m:.3f} {fix.height_m or 0.0:.3f} 0 0 {math.sin(half):.9f} "
+            f"{math.cos(half):.9f}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _accepted(fixes: Sequence[Fix]) -> list[Fix]:
+    return [fix for fix in fixes if fix.is_accepted]
+
+
+def _words(fix: Fix) -> str:
+    return plain(f"heading {fix.heading_deg:.0f} deg, P(false fix) {fix.p_false:.3f}")
+
+
+def _xml(root: ET.Element) -> str:
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+_COLOURS: Final = {"found": "#0a7d33", "withheld": "#b36b00", "not on this map": "#a3142a", "failed": "#666666"}
+_STYLE: Final = """
+:root{color-scheme:light}
+body{font:15px/1.45 system-ui,sans-serif;margin:0 auto;max-width:1060px;padding:16px;color:#222}
+h1{font-size:1.45em;margin:.2em 0}p{margin:.4em 0}.facts{color:#555}.map{position:relative;max-width:100%;margin:12px 0}
+.map img{width:100%;display:block;border:1px solid #bbb}.map svg{position:absolute;inset:0;width:100%;height:100%}
+article{border-top:1px solid #ddd;padding:10px 0}h2{font-size:1.05em;margin:.2em 0;overflow-wrap:anywhere}
+.strip{max-width:100%;display:block;margin-top:6px}.heads{display:grid;grid-template-columns:repeat(4,1fr);max-width:978px;
+color:#555;font-size:.85em;margin-top:6px}b.state{color:#fff;border-radius:3px;padding:1px 7px;font-weight:600}
+.note{color:#8a4b00}footer{border-top:1px solid #ddd;margin-top:16px;color:#555;font-size:.85em}
+"""
+
+
+def page_text(located: Located, region: Region) -> str:
+    """Return the page: all fixes on the map, then each picture, what was seen in it, and the map at its fix."""
+    fixes = located.fixes
+    counts = [(name, sum(fix.status == name for fix in fixes)) for name in _COLOURS]
+    total = counted(len(fixes), "picture")
+    summary = ", ".join(f"{count} {name}" for name, count in counts if count)
+    request = located.request
+    shown = fixes[:MOST_SHOWN]
+    more = f"<p>The first {MOST_SHOWN} pictures are shown; all are in {TABLE}.</p>" if len(fixes) > len(shown) else ""
+    made = f"{_text(request.matcher)} with {_text(request.segmenter)}. {_text(located.calibration)}"
+    files = f"Files beside this page: {TABLE}, GeoJSON, GPX, KML, TUM."
+    parts = [
+        "<!doctype html>",
+        '<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">',
+        f"<title>{_text(total)} located</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{_text(total)} on the map of {_text(located.manifest.title)}</h1>",
+        f"<p>{_text(summary)}. Accepted are fixes with P(false fix) of at most {request.most_false:g}.</p>",
+        f'<p class="facts">Map of {located.manifest.extract.date}; {made}.</p>',
+        _map_html(located, region),
+        more,
+        *(_article(number, fix, request.into) for number, fix in enumerate(shown)),
+        f"<footer>Map data {_text(located.manifest.attribution)}. {files}</footer></body></html>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _text(value: object) -> str:
+    return html.escape(plain(str(value)))
+
+
+def _article(number: int, fix: Fix, folder: Path) -> str:
+    lines = [f"<article id=p{number}><h2>{number + 1}. {_text(fix.file)}</h2>"]
+    facts = [f'<b class="state" style="background:{_COLOURS[fix.status]}">{_text(fix.status)}</b>']
+    if fix.p_false is not None:
+        facts.append(f"P(false fix) {fix.p_false:.3f}")
+    if fix.lon is not None and fix.lat is not None and fix.heading_deg is not None:
+        word = "at" if fix.is_accepted else "best guess"
+        facts.append(f"{word} {fix.lat:.6f}, {fix.lon:.6f} (latitude, longitude), heading {fix.heading_deg:.0f} deg")
+    if fix.file_distance_m is not None:
+        facts.append(f"{fix.file_distance_m:.0f} m from the position in the file")
+    lines.append(f"<p>{facts[0]} {_text('; '.join(facts[1:]))}</p>")
+    if fix.reason:
+        lines.append(f"<p>{_text(fix.reason)}.</p>")
+    if fix.note:
+        lines.append(f'<p class="note">{_text(fix.note)}.</p>')
+    if strip_file(folder / STRIPS, number).is_file():
+        heads = "".join(f"<span>{one}</span>" for one in ("picture", "what the segmenter saw", "evidence", "map there"))
+        lines.append(f'<div class="heads">{heads}</div>')
+        alt = f"{fix.file}: the picture, what the segmenter saw, the evidence, and the map at the fix"
+        lines.append(f'<img class="strip" src="{STRIPS}/{number:04d}.webp" alt="{_text(alt)}" loading="lazy">')
+    return "\n".join([*lines, "</article>"])
+
+
+def _map_html(located: Located, region: Region) -> str:
+    """Return the part of the map around the fixes and the discs that were searched, with a mark for each picture."""
+    fixes = [fix for fix in located.fixes if fix.x_m is not None and fix.y_m is not None]
+    if not fixes:
+        return ""
+    to_grid = _discs(located, fixes)
+    xs = np.array([fix.x_m for fix in fixes] + [disc[0] for disc in to_grid], dtype=float)
+    ys = np.array([fix.y_m for fix in fixes] + [disc[1] for disc in to_grid], dtype=float)
+    reach = max([disc[2] for disc in to_grid], default=300.0)
+    grid = region.grid
+    corners = np.array([(xs.min() - reach, ys.max() + reach), (xs.max() + reach, ys.min() - reach)])
+    cells = np.clip(grid.to_cells(corners), 0, [grid.rows - 1, grid.cols - 1])
+    (top, left), (bottom, right) = cells.tolist()
+    rows, cols = bottom - top + 1, right - left + 1
+    part = grid.window(top, left, rows, cols)
+    layers = region.layers[:, top : top + rows, left : left + cols]
+    coarse = pooled(layers, most_cells=_MAP_PX)
+    picture = _bytes(paint_overview(region.manifest, coarse))
+    encoded = BytesIO()
+    Image.fromarray(picture).save(encoded, format="WEBP", quality=82)
+    data = base64.b64encode(encoded.getvalue()).decode()
+    west, south, east, north = part.bounds_m
+    marks = []
+    for x, y, radius in to_grid[:1]:
+        marks.append(
+            f'<circle cx="{x - west:.1f}" cy="{north - y:.1f}" r="{radius:.1f}" fill="none" stroke="#333" '
+            f'stroke-dasharray="12 8" vector-effect="non-scaling-stroke"><title>searched disc of the first picture'
+            "</title></circle>"
+        )
+    size = max(east - west, north - south)
+    for number, fix in enumerate(located.fixes):
+        if fix.x_m is None or fix.y_m is None or fix.view is None:
+            continue
+        x, y = fix.x_m - west, north - fix.y_m
+        angle = fix.view[2]
+        arrow = size / 70
+        colour = _COLOURS[fix.status]
+        fill = colour if fix.is_accepted else "#fff"
+        marks.append(
+            f'<a href="#p{number}"><g transform="translate({x:.1f} {y:.1f}) rotate({angle:.1f})"><title>'
+            f"{number + 1}. {_text(fix.file)}: {_text(fix.status)}</title>"
+            f'<path d="M0 {-arrow:.1f}L{0.62 * arrow:.1f} {0.8 * arrow:.1f}L0 {0.35 * arrow:.1f}L{-0.62 * arrow:.1f} '
+            f'{0.8 * arrow:.1f}Z" fill="{fill}" stroke="{colour}" stroke-width="2" vector-effect="non-scaling-stroke"/>'
+            "</g></a>"
+        )
+    box = f"0 0 {east - west:.1f} {north - south:.1f}"
+    return (
+        f'<div class="map"><img alt="the map around the fixes" src="data:image/webp;base64,{data}">'
+        f'<svg viewBox="{box}" preserveAspectRatio="none">{"".join(marks)}</svg></div>'
+        '<p class="facts">Arrows point where the picture\'s up points: filled ones are accepted. Broken line: the disc '
+        "that was searched for the first picture.</p>"
+    )
+
+
+def _discs(located: Located, fixes: Sequence[Fix]) -> list[tuple[float, float, float]]:
+    found = []
+    for fix in fixes:
+        if fix.prior_lon is not None and fix.prior_lat is not None and fix.prior_radius_m is not None:
+            east_m, north_m, _ = grid_place(fix.prior_lon, fix.prior_lat, located.manifest.epsg)
+            found.append((east_m, north_m, fix.prior_radius_m))
+    return found

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Locating own pictures from end to end, over a town; its faults, what is kept, and what is written."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+import rasterio
+from affine import Affine
+from PIL import Image
+from pyproj import Geod
+from scipy.spatial.transform import Rotation
+
+import sasgeo_bench as sgb
+from sasgeo_bench.core.errors import ConfigError, MatchError
+from sasgeo_bench.geometry.projection import to_lonlat
+from sasgeo_bench.matching.matcher import Prediction
+from sasgeo_bench.observing import locate as locating
+from sasgeo_bench.observing.chances import Chances, answers_for, shipped_answers
+from sasgeo_bench.observing.locate import COLUMNS, Fix, LocateRequest, locate
+from sasgeo_bench.observing.results import csv_text, geojson_text, gpx_text, kml_text, page_text, tum_text
+from sasgeo_bench.sensing.crops import drawn_crops
+
+TOWN = "town-riverside"
+SIDE_PX, PIXEL_M = 448, 0.5
+
+
+@pytest.fixture(scope="module")
+def crop(towns: Path) -> sgb.Crop:
+    """A drawn picture of the town with the pose at which it was drawn."""
+    region = sgb.read_region(towns / "regions" / TOWN)
+    return next(islice(drawn_crops([region], seed=11, side_px=SIDE_PX, pixel_m=PIXEL_M, zoom=1.0), 6, None))
+
+
+@pytest.fixture(scope="module")
+def pictures(towns: Path, crop, tmp_path_factory) -> Path:
+    """The picture as a turned GeoTIFF, and as a plain PNG beside a file that is none."""
+    folder = tmp_path_factory.mktemp("pictures")
+    epsg = sgb.read_region(towns / "regions" / TOWN).grid.epsg
+    place = Affine.translation(crop.pose.easting_m, crop.pose.northing_m) @ Affine.rotation(-crop.pose.yaw_deg)
+    transform = place @ Affine.scale(crop.pixel_m, -crop.pixel_m) @ Affine.translation(-SIDE_PX / 2, -SIDE_PX / 2)
+    profile = {"driver": "GTiff", "width": SIDE_PX, "height": SIDE_PX, "count": 3, "dtype": "uint8"}
+    with rasterio.open(
+        folder / "a.tif", "w", crs=f"EPSG:{epsg}", transform=transform, photometric="RGB", **profile
+    ) as out:
+        out.write(np.moveaxis(crop.rgb, 2, 0))
+    (folder / "b.jpg").write_text("no picture")
+    Image.fromarray(crop.rgb).save(folder / "c.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def located(towns: Path, pictures: Path, tmp_path_factory):
+    """The folder of pictures, located once by the program's own defaults."""
+    into = tmp_path_factory.mktemp("located")
+    width = SIDE_PX * PIXEL_M
+    found = sgb.locate(pictures, out=towns, into=into, ground_width=width, region=TOWN, most_false=0.1, trusted=True)
+    return into, found
+
+
+def off(fix: Fix, pose: sgb.Pose) -> float:
+    return math.hypot(fix.x_m - pose.easting_m, fix.y_m - pose.northing_m)
+
+
+def test_a_drawn_picture_is_found_where_it_was_drawn(located, crop):
+    _, found = located
+    fix = found.fixes[0]
+    assert (fix.file, fix.status, fix.is_accepted) == ("a.tif", "found", True)
+    assert off(fix, crop.pose) < 5.0
+    assert fix.file_distance_m == pytest.approx(off(fix, crop.pose), abs=0.5)
+    lon, lat = to_lonlat(found.manifest.epsg).transform(fix.x_m, fix.y_m)
+    assert (fix.lon, fix.lat) == pytest.approx((lon, lat), abs=1e-6)
+    assert fix.p_false <= 0.1
+
+
+def test_the_position_in_the_file_lies_in_the_disc_and_not_in_its_middle(located, crop):
+    fix = located[1].fixes[0]
+    lon, lat = to_lonlat(located[1].manifest.epsg).transform(crop.pose.easting_m, crop.pose.northing_m)
+    away_m = Geod(ellps="WGS84").inv(lon, lat, fix.prior_lon, fix.prior_lat)[2]
+    assert 10.0 < away_m <= fix.prior_radius_m == 500.0
+
+
+def test_without_a_position_the_whole_map_is_searched_and_said_to_be_uncalibrated(located):
+    fix = located[1].fixes[2]
+    assert fix.file == "c.png"
+    assert (fix.prior_lon, fix.prior_radius_m, fix.file_distance_m) == (None, None, None)
+    assert "not calibrated on pictures like yours" in fix.note
+    assert "a whole map searched" in fix.note
+    assert "an unknown heading" in fix.note
+
+
+def test_one_picture_that_is_none_costs_its_own_row(located):
+    into, found = located
+    assert [fix.status for fix in found.fixes].count("failed") == 1
+    with (into / "locate.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["file"] for row in rows] == ["a.tif", "b.jpg", "c.png"]
+    assert tuple(rows[0]) == COLUMNS
+    assert rows[1]["status"] == "failed"
+    assert "no JPEG, TIFF or DNG" in rows[1]["reason"]
+    assert rows[1]["lon"] == rows[1]["p_false"] == ""
+    assert (rows[0]["is_accepted"], rows[1]["is_accepted"]) == ("true", "false")
+
+
+def test_the_page_shows_every_picture_and_what_the_chances_stand_on(located):
+    into, _ = located
+    page = (into / "index.html").read_text()
+    assert page.count("<article") == 3
+    assert "calibrated on" in page
+    assert "OpenStreetMap contributors" in page
+    with Image.open(into / "pictures" / "0000.webp") as strip:
+        assert strip.size == (4 * 240 + 3 * 6, 240)
+        pixels = np.asarray(strip.convert("RGB"))
+    assert pixels[:, :240].std() > 5  # the picture
+    assert pixels[:, -240:].std() > 5  # the map
+    assert not (into / "pictures" / "0001.webp").exists()
+
+
+def test_a_second_call_asks_nothing_anew_and_tries_what_failed(located, towns, pictures, monkeypatch):
+    into, found = located
+    asked = []
+    one = locating._Asker.ask
+    monkeypatch.setattr(locating._Asker, "ask", lambda self, path, name: (asked.append(name), one(self, path, name))[1])
+    again = sgb.locate(
+        pictures, out=towns, into=into, ground_width=SIDE_PX * PIXEL_M, region=TOWN, most_false=0.1, trusted=True
+    )
+    assert asked == ["b.jpg"]
+    assert [replace(fix, seconds=0.0) for fix in again.fixes] == [replace(fix, seconds=0.0) for fix in found.fixes]
+
+
+def test_a_line_that_was_cut_off_is_asked_again(located, tmp_path):
+    into, _ = located
+    text = (into / "answers.jsonl").read_text()
+    (tmp_path / "answers.jsonl").write_text(text[: len(text) - 40])
+    kept, whole = locating._kept(tmp_path / "answers.jsonl"), locating._kept(into / "answers.jsonl")
+    assert len(kept) == len(whole) - 1
+    assert all(whole[key] == fix for key, fix in kept.items())
+
+
+def test_a_map_is_chosen_by_the_position(towns, pictures, tmp_path):
+    request = LocateRequest(pictures=pictures, out=towns, into=tmp_path)
+    paths = [pictures / "b.jpg", pictures / "a.tif"]
+    assert locating._region_of(request, paths).name.partition("@")[0] == TOWN
+    with pytest.raises(ConfigError, match=r"new-region NAME --center 100\.00000,10\.00000"):
+        locating._region_of(replace(request, near=(100.0, 10.0)), paths)
+    with pytest.raises(ConfigError, match="no picture says where it was taken"):
+        locating._region_of(request, [pictures / "c.png"])
+
+
+def test_a_picture_of_another_place_is_a_row(towns, pictures, tmp_path):
+    found = locate(
+        LocateRequest(
+            pictures=pictures / "a.tif",
+            out=towns,
+            into=tmp_path,
+            region=towns / "regions" / TOWN,
+            near=(100.0, 10.0),
+            is_sandboxed=False,
+        )
+    )
+    assert found.fixes[0].status == "failed"
+    assert "km beside the map" in found.fixes[0].reason
+
+
+def test_a_segmenter_that_must_learn_is_refused(towns, pictures, tmp_path):
+    request = LocateRequest(
+        pictures=pictures / "a.tif",
+        out=towns,
+        into=tmp_path,
+        segmenter="pixel_forest",
+        region=towns / "regions" / TOWN,
+        is_sandboxed=False,
+    )
+    with pytest.raises(MatchError, match="pixel_forest needs training"):
+        locate(request)
+
+
+def test_a_matcher_without_stored_answers_accepts_nothing(towns, pictures, tmp_path):
+    found = locate(
+        LocateRequest(
+            pictures=pictures / "a.tif",
+            out=towns,
+            into=tmp_path,
+            matcher="raster_soft",
+            region=towns / "regions" / TOWN,
+            is_sandboxed=False,
+        )
+    )
+    (fix,) = found.fixes
+    assert (fix.status, fix.is_accepted, fix.p_false) == ("withheld", False, None)
+    assert "not calibrated" in fix.reason
+    assert fix.lon is not None
+
+
+def test_stored_answers_order_right_before_false():
+    answers = answers_for("sasgeo", sgb.load_matcher("sasgeo").card.version, "osm_unet")
+    assert answers is not None
+    assert answers is shipped_answers()[0]
+    chances = Chances.of(answers)
+    p_false = np.array([chances.p_false(item) for item in answers.predictions()])
+    false = answers.is_false
+    assert p_false[false].mean() > 0.7
+    assert p_false[~false].mean() < 0.3
+    # a place that is left out changes the fit
+    without = Chances.of(answers, without=[answers.places[0]])
+    assert without.p_false(answers.predictions()[0]) != chances.p_false(answers.predictions()[0])
+    assert answers_for("sasgeo", "0", "osm_unet") is None
+    assert answers_for("sasgeo", answers.version, "colour_thresholds") is None
+
+
+def test_an_answer_says_why_it_is_withheld(towns):
+    request = LocateRequest(pictures=Path("a"), out=towns, into=Path("b"))
+    asker = object.__new__(locating._Asker)
+    asker._request = request
+    prior = sgb.Prior(center_m=(0.0, 0.0), radius_m=500.0, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
+    answer = Prediction(query_id="q", diagnostics={"modes_above": 3.0})
+    assert asker._verdict(answer, 0.05, prior) == ("found", "")
+    assert asker._verdict(answer, 0.3, prior) == ("withheld", "2 other places within 500 m look alike")
+    assert asker._verdict(answer, 0.9, prior)[0] == "not on this map"
+    assert asker._verdict(answer, None, prior)[0] == "withheld"
+
+
+FIXES = (
+    Fix(
+        file="<b>&.jpg",
+        status="found",
+        lon=9.5,
+        lat=47.1,
+        x_m=537_000.0,
+        y_m=5_216_000.0,
+        heading_deg=89.7,
+        p_false=0.01,
+        is_accepted=True,
+        taken_at="2024-05-01T10:20:30",
+        height_m=80.0,
+        view=(537_000.0, 5_216_000.0, 90.0, 1.0),
+    ),
+    Fix(file="=1+1.jpg", status="withheld", lon=9.6, lat=47.2, p_false=0.5, heading_deg=1.0, reason="2 places, alike"),
+    Fix(file="c.jpg", status="failed", reason="damaged"),
+)
+
+
+def test_tables_hold_all_pictures_and_tracks_the_accepted_ones():
+    rows = list(csv.DictReader(csv_text(FIXES).splitlines()))
+    assert [row["file"] for row in rows] == ["<b>&.jpg", "'=1+1.jpg", "c.jpg"]
+    assert rows[1]["reason"] == "2 places, alike"
+    places = json.loads(geojson_text(FIXES, "(c) OpenStreetMap contributors, ODbL"))
+    assert [one["geometry"]["coordinates"] for one in places["features"]] == [[9.5, 47.1], [9.6, 47.2]]
+    assert "OpenStreetMap" in places["attribution"]
+    gpx = ET.fromstring(gpx_text(FIXES, "credit"))  # noqa: S314 - our own text
+    space = "{http://www.topografix.com/GPX/1/1}"
+    points = gpx.findall(f"{space}wpt")
+    assert [(one.get("lat"), one.get("lon"), one.findtext(f"{space}name")) for one in points] == [
+        ("47.1000000", "9.5000000", "<b>&.jpg")
+    ]
+    kml = ET.fromstring(kml_text(FIXES, "credit"))  # noqa: S314
+    assert kml.find(".//{http://www.opengis.net/kml/2.2}coordinates").text == "9.5000000,47.1000000"
+
+
+def test_a_trajectory_has_the_heading_as_scipy_reads_it():
+    (head, line) = tum_text(FIXES).splitlines()
+    assert head.startswith("#")
+    numbers = np.array(line.split(), dtype=float)
+    assert numbers[0] == 1714558830.0  # 2024-05-01 10:20:30 UTC
+    assert numbers[1:4].tolist() == [537_000.0, 5_216_000.0, 80.0]
+    ahead = Rotation.from_quat(numbers[4:]).apply([1.0, 0.0, 0.0])
+    assert ahead == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)  # a heading of 90 degrees is east
+
+
+def test_names_of_files_are_text_on_the_page(located, towns):
+    found = replace(located[1], fixes=FIXES)
+    page = page_text(found, sgb.read_region(towns / "regions" / TOWN))
+    assert "<b>&.jpg" not in page
+    assert "&lt;b&gt;&amp;.jpg" in page
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (("--near", "47.1"), "--near is LON,LAT"),
+        (("--near", "9.5,147.1"), "--near is longitude,latitude"),
+        (("--heading", "north"), "--heading is DEG"),
+        (("--heading", "10+-0"), "--heading is DEG"),
+        (("--radius", "0"), "--radius lies within"),
+        (("--height", "-5"), "height is above 0"),
+        (("--most-false", "1"), "--most-false lies between"),
+        (("--region", "nowhere"), "nowhere"),
+    ],
+)
+def test_words_that_make_no_sense_end_in_one_line(mistake, pictures, towns, words, hint):
+    assert hint in mistake("locate", pictures / "a.tif", "--out", towns, *words)
+
+
+def test_no_picture_is_one_line(mistake, tmp_path):
+    assert "there is no picture or folder" in mistake("locate", tmp_path / "none.jpg")
+    assert "holds no picture" in mistake("locate", tmp_path)

@@ -41,6 +41,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     },
     "Your own pictures": {
         "locate": "observing",
+        "import-photos": "importing_photos",
     },
     "Queries": {
         "make-queries": "queries",

@@ -6,7 +6,6 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -16,11 +15,11 @@ from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_pro
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import plain
 from sasgeo_bench.observing.locate import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results
-from sasgeo_bench.regions.region_files import read_region
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
 _PAIR: Final = re.compile(r"\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*,\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*")
@@ -104,12 +103,12 @@ def locate(options: LocateOptions) -> Located:
         most_false=options.most_false,
         is_sandboxed=not options.trusted,
     )
-    found = located_by(request, lambda region: Strips(into, partial(read_region, region)))
+    found = located_by(request, lambda region: Strips(into, region))
     for fix in found.fixes:
         options.say(line_of(fix))
     for note in (found.calibration, *notes_of(found.fixes)):
         tell(note)
-    write_results(found, read_region(found.region))
+    write_results(found)
     return found
 
 
@@ -127,7 +126,7 @@ def line_of(fix: Fix) -> str:
         words.append(f"P(false fix) {fix.p_false:.3f}")
     if fix.file_distance_m is not None:
         words.append(f"{fix.file_distance_m:.0f} m from the file's position")
-    text = f"{fix.file}: {', '.join(words)}"
+    text = f"{plain(fix.file)}: {', '.join(words)}"
     return f"{text}: {fix.reason}" if fix.reason else text
 
 

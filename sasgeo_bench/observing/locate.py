@@ -402,7 +402,8 @@ class _Asker:
             prior, centre = self._prior(picture, name)
             sight = see(picture, self._request.told)
         except SasgeoError as error:
-            return Fix(file=name, status="failed", reason=one_line(str(error)), seconds=_since(begun))
+            why = str(error).removeprefix(f"{path.name} ").removeprefix(f"{path} ")
+            return Fix(file=name, status="failed", reason=one_line(why), seconds=_since(begun))
         card = self._segmenter_card.result()
         classes = card.classes
         reply = guarded(lambda: self._segmenter.segment(sight.image, classes=classes), self._request.out, card.name)

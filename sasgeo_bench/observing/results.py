@@ -7,7 +7,7 @@ import datetime as dt
 import html
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from io import BytesIO, StringIO
 from pathlib import Path
@@ -24,9 +24,10 @@ from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.texts import csv_cell, plain
 from sasgeo_bench.observing.locate import COLUMNS, Fix, Located, Seen, Watch
 from sasgeo_bench.observing.pictures import grid_place
-from sasgeo_bench.regions.evidence import LayerBits, observe
+from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
+from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import paint_overview, pooled
-from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region_files import LAYERS, read_manifest
 from sasgeo_bench.sensing.birdseye import rectify
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.tasks.segmented import Segmented
@@ -38,15 +39,15 @@ STRIPS: Final = "pictures"
 MOST_SHOWN: Final = 300  # pictures on a page
 _PANEL_PX: Final = 240
 _MAP_PX: Final = 1000
+_MOST_CELLS: Final = 3000  # of the map along a side that are read at full resolution
 _MEND: Final = "name another folder by --into, or check your rights and the free space"
 
 
 class Strips(Watch):
     """Draws each picture beside its evidence and the map at its fix, into files of a page."""
 
-    def __init__(self, folder: Path, region: Callable[[], Region]) -> None:
-        self._folder, self._open = folder / STRIPS, region
-        self._map: tuple[Region, LayerBits] | None = None
+    def __init__(self, folder: Path, region: Path) -> None:
+        self._folder, self._map = folder / STRIPS, _Map(region)
 
     def is_shown(self, number: int) -> bool:
         """Return whether the strip of a picture is there, or none is wanted."""
@@ -56,10 +57,7 @@ class Strips(Watch):
         """Draw the strip of a picture."""
         if number >= MOST_SHOWN:
             return
-        if self._map is None:
-            region = self._open()
-            self._map = (region, LayerBits.of(region.layers))
-        panels = strip(seen, *self._map)
+        panels = strip(seen, self._map.at(seen))
         path = strip_file(self._folder, number)
         with fresh_file(path, mend=_MEND) as scratch:
             Image.fromarray(panels).save(scratch, format="WEBP", quality=80)
@@ -70,30 +68,74 @@ def strip_file(folder: Path, number: int) -> Path:
     return folder / f"{number:04d}.webp"
 
 
-def strip(seen: Seen, region: Region, layers: LayerBits) -> NDArray[np.uint8]:
+def strip(seen: Seen, there: Evidence | None) -> NDArray[np.uint8]:
     """Return the picture, what the segmenter saw, the evidence and the map at the fix, side by side, heading up."""
-    sight, evidence = seen.sight, seen.evidence
-    lattice = {"size_cells": sight.size_cells, "cell_size_m": sight.cell_size_m, "pose": sight.pose}
+    sight = seen.sight
     over = Segmented.of(seen.segmentation).over(sight.image.rgb)
-    panels = [rectify(picture, sight.image.camera, Plane(), **lattice) for picture in (sight.image.rgb, over)]  # type: ignore[arg-type]
-    panels.append(_bytes(paint(evidence)))
-    pose = seen.fix.view_pose
-    if pose is None:
-        panels.append(np.full_like(panels[0], 235))
-    else:
-        cells = observe(layers, region.grid, pose, size_cells=sight.size_cells, cell_size_m=sight.cell_size_m)
-        order = [region.classes.index(name) for name in evidence.classes]
-        panels.append(_bytes(paint(evidence.replace(cells[order]))))
+    panels = [
+        rectify(
+            picture,
+            sight.image.camera,
+            Plane(),
+            size_cells=sight.size_cells,
+            cell_size_m=sight.cell_size_m,
+            pose=sight.pose,
+        )
+        for picture in (sight.image.rgb, over)
+    ]
+    panels.append(_bytes(paint(seen.evidence)))
+    panels.append(np.full_like(panels[0], 235) if there is None else _bytes(paint(there)))
     gap = np.full((_PANEL_PX, 6, 3), 255, dtype=np.uint8)
     fitted = [cv2.resize(one, (_PANEL_PX, _PANEL_PX), interpolation=cv2.INTER_AREA) for one in panels]
     return np.concatenate([part for one in fitted for part in (one, gap)][:-1], axis=1)
+
+
+class _Map:
+    """The layers of a region, of which parts are read: a country's do not fit into memory."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file, self.manifest = folder / LAYERS, read_manifest(folder)
+
+    def at(self, seen: Seen) -> Evidence | None:
+        """Return the map at the fix of a picture, as a view of its size and classes; None without a fix."""
+        pose, sight, evidence = seen.fix.view_pose, seen.sight, seen.evidence
+        if pose is None:
+            return None
+        half_m = sight.side_m * pose.scale
+        east_m, north_m = pose.easting_m, pose.northing_m
+        window = self._window(np.array([(east_m - half_m, north_m + half_m), (east_m + half_m, north_m - half_m)]))
+        layers = LayerBits.of(read_layers(self._file, window=window))
+        grid = self.manifest.grid.window(*window)
+        cells = observe(layers, grid, pose, size_cells=sight.size_cells, cell_size_m=sight.cell_size_m)
+        return evidence.replace(cells[[self.manifest.classes.index(name) for name in evidence.classes]])
+
+    def painted(self, corners_m: NDArray[np.float64]) -> tuple[NDArray[np.uint8], tuple[float, float, float, float]]:
+        """Return the colours of a part, by its north-western and south-eastern corners, and its bounds."""
+        row, col, rows, cols = self._window(corners_m)
+        grid = self.manifest.grid
+        part = grid.window(row, col, rows, cols)
+        if max(rows, cols) <= _MOST_CELLS:
+            layers = read_layers(self._file, window=(row, col, rows, cols))
+        else:
+            overview = read_overview(self._file, longest_cells=max(_MAP_PX, _MAP_PX * grid.rows // rows))
+            step = grid.rows / overview.shape[1]
+            ends = (math.floor(row / step), math.floor(col / step), math.ceil(rows / step), math.ceil(cols / step))
+            layers = overview[:, ends[0] : ends[0] + ends[2], ends[1] : ends[1] + ends[3]]
+        colours = paint_overview(self.manifest, pooled(layers, most_cells=_MAP_PX))
+        return _bytes(colours), part.bounds_m
+
+    def _window(self, corners_m: NDArray[np.float64]) -> tuple[int, int, int, int]:
+        grid = self.manifest.grid
+        cells = np.clip(grid.to_cells(corners_m), 0, [grid.rows - 1, grid.cols - 1])
+        (top, left), (bottom, right) = cells.tolist()
+        return top, left, bottom - top + 1, right - left + 1
 
 
 def _bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.asarray(np.rint(255 * colours), dtype=np.uint8)
 
 
-def write_results(located: Located, region: Region) -> list[Path]:
+def write_results(located: Located) -> list[Path]:
     """Write table, GeoJSON, GPX, KML, TUM and page into the folder of the request; return their paths.
 
     GPX, KML and TUM hold accepted fixes alone, the others all. Raise `StoreError` if one cannot be written.
@@ -106,7 +148,7 @@ def write_results(located: Located, region: Region) -> list[Path]:
         "locate.gpx": gpx_text(fixes, credit),
         "locate.kml": kml_text(fixes, credit),
         "locate.tum": tum_text(fixes),
-        PAGE: page_text(located, region),
+        PAGE: page_text(located),
     }
     for name, text in texts.items():
         with fresh_file(folder / name, mend=_MEND) as scratch:
@@ -217,7 +259,7 @@ color:#555;font-size:.85em;margin-top:6px}b.state{color:#fff;border-radius:3px;p
 """
 
 
-def page_text(located: Located, region: Region) -> str:
+def page_text(located: Located) -> str:
     """Return the page: all fixes on the map, then each picture, what was seen in it, and the map at its fix."""
     fixes = located.fixes
     counts = [(name, sum(fix.status == name for fix in fixes)) for name in _COLOURS]
@@ -235,7 +277,7 @@ def page_text(located: Located, region: Region) -> str:
         f"<h1>{_text(total)} on the map of {_text(located.manifest.title)}</h1>",
         f"<p>{_text(summary)}. Accepted are fixes with P(false fix) of at most {request.most_false:g}.</p>",
         f'<p class="facts">Map of {located.manifest.extract.date}; {made}.</p>',
-        _map_html(located, region),
+        _map_html(located),
         more,
         *(_article(number, fix, request.into) for number, fix in enumerate(shown)),
         f"<footer>Map data {_text(located.manifest.attribution)}. {files}</footer></body></html>",
@@ -270,7 +312,7 @@ def _article(number: int, fix: Fix, folder: Path) -> str:
     return "\n".join([*lines, "</article>"])
 
 
-def _map_html(located: Located, region: Region) -> str:
+def _map_html(located: Located) -> str:
     """Return the part of the map around the fixes and the discs that were searched, with a mark for each picture."""
     fixes = [fix for fix in located.fixes if fix.x_m is not None and fix.y_m is not None]
     if not fixes:
@@ -279,19 +321,11 @@ def _map_html(located: Located, region: Region) -> str:
     xs = np.array([fix.x_m for fix in fixes] + [disc[0] for disc in to_grid], dtype=float)
     ys = np.array([fix.y_m for fix in fixes] + [disc[1] for disc in to_grid], dtype=float)
     reach = max([disc[2] for disc in to_grid], default=300.0)
-    grid = region.grid
     corners = np.array([(xs.min() - reach, ys.max() + reach), (xs.max() + reach, ys.min() - reach)])
-    cells = np.clip(grid.to_cells(corners), 0, [grid.rows - 1, grid.cols - 1])
-    (top, left), (bottom, right) = cells.tolist()
-    rows, cols = bottom - top + 1, right - left + 1
-    part = grid.window(top, left, rows, cols)
-    layers = region.layers[:, top : top + rows, left : left + cols]
-    coarse = pooled(layers, most_cells=_MAP_PX)
-    picture = _bytes(paint_overview(region.manifest, coarse))
+    picture, (west, south, east, north) = _Map(located.region).painted(corners)
     encoded = BytesIO()
     Image.fromarray(picture).save(encoded, format="WEBP", quality=82)
     data = base64.b64encode(encoded.getvalue()).decode()
-    west, south, east, north = part.bounds_m
     marks = []
     for x, y, radius in to_grid[:1]:
         marks.append(

@@ -18,6 +18,7 @@ from pyproj import Geod
 from scipy.spatial.transform import Rotation
 
 import sasgeo_bench as sgb
+from sasgeo_bench.cli.observing import line_of
 from sasgeo_bench.core.errors import ConfigError, MatchError
 from sasgeo_bench.geometry.projection import to_lonlat
 from sasgeo_bench.matching.matcher import Prediction
@@ -273,9 +274,9 @@ def test_a_trajectory_has_the_heading_as_scipy_reads_it():
     assert ahead == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)  # a heading of 90 degrees is east
 
 
-def test_names_of_files_are_text_on_the_page(located, towns):
+def test_names_of_files_are_text_on_the_page(located):
     found = replace(located[1], fixes=FIXES)
-    page = page_text(found, sgb.read_region(towns / "regions" / TOWN))
+    page = page_text(found)
     assert "<b>&.jpg" not in page
     assert "&lt;b&gt;&amp;.jpg" in page
 
@@ -295,6 +296,10 @@ def test_names_of_files_are_text_on_the_page(located, towns):
 )
 def test_words_that_make_no_sense_end_in_one_line(mistake, pictures, towns, words, hint):
     assert hint in mistake("locate", pictures / "a.tif", "--out", towns, *words)
+
+
+def test_a_line_of_a_fix_is_one_line():
+    assert line_of(Fix(file="new\nline.jpg", status="failed", reason="damaged")) == "new line.jpg: failed: damaged"
 
 
 def test_no_picture_is_one_line(mistake, tmp_path):

@@ -22,10 +22,10 @@ from sasgeo_bench.flights.odometry import Odometry, draw_odometry
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.observing.picture_poses import PoseFacts
-from sasgeo_bench.observing.pictures import Sight, list_pictures, names_of, see
+from sasgeo_bench.observing.pictures import list_pictures, names_of, see
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.observing.posed_pictures import Heights, PosedPicture, PosedPictures, lenses_of, pose_pictures
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.sensing.image import AerialImage
@@ -60,6 +60,8 @@ _MOST_PX: Final = 768  # of a side of a picture in a task, as in the suites
 _BLOCK_M: Final = 1000.0
 _FASTEST_MPS: Final = 40.0  # of a drone between two pictures
 _SHOWN: Final = 3
+_CELLS: Final = 16  # of which the side of a view is a multiple, so that a board has few kinds of views
+_STEPS_M: Final = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # of standard deviations, which are rounded up for scoring
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,9 +124,9 @@ def import_photos(request: ImportRequest) -> tuple[Task, ...]:
     """Write the tasks of some pictures: single views, and flights where pictures follow each other.
 
     The truth is the middle of the ground that a picture shows, a square as `locate` sees it. It is as good as the
-    position in the file or table: its standard deviation is stored with it (`measured["truth_sigma_m"]`), and success
-    within a tolerance of less than two of them is not scored. Evidence is unknown until `segment` has made it. Priors
-    are drawn as in the suites: the truth lies anywhere in the disc.
+    position in the file or table: its standard deviation is stored with it (`measured["truth_sigma_m"]`). Rounded up to
+    0.5, 1, 2, 5, 10 m, it is the strength of the query: success within less than two of these is not scored. Evidence
+    is unknown until `segment` has made it. Priors are drawn as in the suites: the truth lies anywhere in the disc.
 
     Raises
     ------
@@ -239,13 +241,14 @@ class _Writer:
     def _origin(self, suite: str, pictures: Sequence[PosedPicture]) -> TaskOrigin:
         sigmas_m = [one.sigma_m for one in pictures]
         by = "their files" if self.request.poses is None else self.request.poses.name
+        searched = self.request.group.words.removeprefix("searched: ")
         return TaskOrigin(
             suite=suite,
             suite_version=_VERSION,
             title=f"Pictures of one's own ({suite})",
-            what=f"{counted(len(pictures), 'picture')} with poses by {plain(by)}, in discs of "
-            f"{self.request.group.words.removeprefix('searched: ')}. Truths have a standard deviation of "
-            f"{min(sigmas_m):.1f} to {max(sigmas_m):.1f} m: success within less than two of them is not scored.",
+            what=f"{counted(len(pictures), 'picture')} with poses by {plain(by)}, searched: {searched}. Truths have a "
+            f"standard deviation of {min(sigmas_m):.1f} to {max(sigmas_m):.1f} m: success within less than two of "
+            "them, rounded up, is not scored.",
             separates="What a method does on one's own pictures from what it does on others.",
             falsifier="none",
             strength_unit=TRUTH_SIGMA,
@@ -325,7 +328,8 @@ class _Writer:
             self.failed_by.setdefault(f"that cannot be decoded ({plain(str(error))[:120]})", []).append(one.name)
             return None
         state, group = self.state, self.request.group
-        evidence = unseen(state.classes, sight.size_cells, sight.cell_size_m)
+        size_cells = sight.size_cells // _CELLS * _CELLS
+        evidence = unseen(state.classes, size_cells, sight.cell_size_m)
         taken = one.picture.taken_at
         query = Query(
             query_id=query_id,
@@ -342,7 +346,7 @@ class _Writer:
             frames=(frame,),
             step=step,
         )
-        density = self._density(one, sight)
+        density = self._density(one, evidence)
         block = "-".join(str(math.floor(value / _BLOCK_M)) for value in (one.pose.easting_m, one.pose.northing_m))
         truth = Truth(
             query_id=query_id,
@@ -352,7 +356,7 @@ class _Writer:
             pair_id=seeds.digest("pair", one.name).hex()[:16],
             role="control",
             kind="own picture",
-            strength=one.sigma_m,
+            strength=next((step for step in _STEPS_M if step >= one.sigma_m), one.sigma_m),
             strength_unit=TRUTH_SIGMA,
             unknown_share=evidence.unknown_share,
             changed_share=0.0,
@@ -372,9 +376,9 @@ class _Writer:
         )
         return query, truth
 
-    def _density(self, one: PosedPicture, sight: Sight) -> float:
+    def _density(self, one: PosedPicture, evidence: Evidence) -> float:
         """Return the share of a view's cells in which the map shows a road, building, water or other drawn feature."""
-        view = self.state.view(one.pose, size_cells=sight.size_cells, cell_size_m=sight.cell_size_m)
+        view = self.state.view(one.pose, size_cells=evidence.shape[0], cell_size_m=evidence.cell_size_m)
         layers = [view.classes.index(name) for name in (*DRAWN_CLASSES, "water") if name in view.classes]
         return float((view.cells[layers] == PRESENT).any(axis=0).mean())
 

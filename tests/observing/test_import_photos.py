@@ -19,6 +19,7 @@ from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.observing.import_photos import ImportRequest, flights_of, import_photos
 from sasgeo_bench.observing.pictures import OwnPicture
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights, PosedPicture
+from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.sensing.crops import drawn_crops
 from sasgeo_bench.tasks.query import TRUTH_SIGMA
 from sasgeo_bench.tasks.task_files import Task
@@ -240,10 +241,9 @@ def test_the_truth_says_how_far_it_is_off(region, middle, laid):
     found = sorted(truth.measured["truth_sigma_m"] for truth in task.truths)
     # A degree of tilt at 80 m is 1.4 m beside the place of the camera.
     assert found == pytest.approx([math.hypot(0.02, 1.4), math.hypot(GPS_SIGMA_M, 1.4)], abs=0.01)
-    assert all(
-        (truth.strength, truth.strength_unit) == (truth.measured["truth_sigma_m"], TRUTH_SIGMA) for truth in task.truths
-    )
-    assert "1.4 to 3.6 m: success within less than two of them is not scored" in task.manifest.what
+    assert {truth.strength_unit for truth in task.truths} == {TRUTH_SIGMA}
+    assert sorted(truth.strength for truth in task.truths) == [2.0, 5.0]
+    assert "1.4 to 3.6 m: success within less than two of them, rounded up" in task.manifest.what
     (task,), _ = quiet(laid(rows, sigma_m=0.5))
     assert min(truth.measured["truth_sigma_m"] for truth in task.truths) == pytest.approx(
         math.hypot(0.02, 1.4), abs=0.01
@@ -406,3 +406,17 @@ def test_the_command_prints_the_folders_of_its_tasks(region, middle, laid, progr
     assert "1 query in" in err
     manifest = Task.open(request.out / "tasks" / "photos" / TOWN).manifest
     assert (manifest.suite, manifest.queries, manifest.frames) == ("photos", 1, 1)
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_segmenter_that_need_not_learn_sees_pictures_of_a_task_without_a_split(region, middle, laid):
+    tasks, _ = quiet(laid([row(region, "a.png", middle)]))
+    wanted = SegmentTasks(
+        spec="colour_thresholds", tasks=[tasks[0].folder], split=None, out=tasks[0].root, is_sandboxed=False
+    )
+    (folder,) = segment_tasks(wanted)
+    (query,) = Task.open(folder).queries()
+    assert query.suite == "photos+colour_thresholds"
+    assert query.evidence.unknown_share < 1.0
+    with pytest.raises(ConfigError, match="unet needs training, and these tasks have no split: name one with --split"):
+        segment_tasks(replace(wanted, spec="unet"))

@@ -13,7 +13,7 @@ import rasterio
 from PIL import ExifTags, Image
 from rasterio.errors import RasterioError
 
-from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError
+from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError, counted
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, rotation
@@ -149,6 +149,7 @@ def pose_pictures(
             found.left_out[stand].append(name)
         else:
             seen.append(stand)
+    found.notes += _clocks(seen)
     ground = _ground(heights, seen, epsg, found) if seen else None
     for stand in seen:
         posed = _posed(stand, heights, ground)
@@ -208,6 +209,11 @@ class _Stand:
         return self.photo.altitude_m, "sea"
 
     @property
+    def exif_s(self) -> float | None:
+        taken = self.photo.taken_at
+        return None if taken is None else taken.replace(tzinfo=dt.UTC).timestamp()
+
+    @property
     def height_m(self) -> float | None:
         return self.photo.height_m if self.row is None or self.row.height_m is None else self.row.height_m
 
@@ -261,6 +267,20 @@ def _photo(path: Path) -> tuple[Photo, float | None]:
     return read_photo(path, most_bytes=_MOST_BYTES), sigma_m if sigma_m is not None and sigma_m > 0 else None
 
 
+def _clocks(seen: Sequence[_Stand]) -> list[str]:
+    """Return a line where a table has other times than the photos themselves, both by a local clock."""
+    off_s = [
+        stand.row.time_s - stand.exif_s
+        for stand in seen
+        if stand.row is not None and stand.row.clock == "local" and stand.row.time_s and stand.exif_s is not None
+    ]
+    odd = [value for value in off_s if abs(value) > 1.0]  # EXIF counts seconds
+    if not odd:
+        return []
+    off = f"{float(np.median(odd)):+.0f} s (median) off EXIF at {len(odd)} of {counted(len(off_s), 'picture')}"
+    return [f"clocks disagree: the table is {off}; the table's times are taken"]
+
+
 def _ground(heights: Heights, seen: Sequence[_Stand], epsg: int, found: PosedPictures) -> Dem | None:
     """Read the heights of the ground around all cameras, and say what they count from."""
     if heights.dem is None:
@@ -304,7 +324,6 @@ def _posed(stand: _Stand, heights: Heights, dem: Dem | None) -> PosedPicture | s
             height_m = found_m if isinstance(found_m, float) else height_m
     sigma_m = float(np.hypot(stand.sigma_m, _TILT_SIGMA * camera.height_m))
     photo, row = stand.photo, stand.row
-    time_s = None if photo.taken_at is None else photo.taken_at.replace(tzinfo=dt.UTC).timestamp()
     return PosedPicture(
         name=stand.name,
         picture=OwnPicture(
@@ -320,7 +339,7 @@ def _posed(stand: _Stand, heights: Heights, dem: Dem | None) -> PosedPicture | s
         sigma_m=round(sigma_m, 2),
         position_m=(camera.east_m, camera.north_m, camera.height_m),
         side_m=side_m,
-        time_s=row.time_s if row is not None and row.time_s is not None else time_s,
+        time_s=row.time_s if row is not None and row.time_s is not None else stand.exif_s,
         lens=f"{photo.model or 'camera'} {photo.width_px} x {photo.height_px}",
     )
 

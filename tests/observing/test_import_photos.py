@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from PIL import Image
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
 from pyproj import Transformer
 from rasterio.transform import from_origin
 
@@ -24,6 +25,7 @@ from sasgeo_bench.sensing.crops import drawn_crops
 from sasgeo_bench.tasks.query import TRUTH_SIGMA
 from sasgeo_bench.tasks.task_files import Task
 from tests import pose_files
+from tests.sensing.test_photos import write_photo, xmp_of
 
 TOWN = "town-riverside"
 WIDTH, HEIGHT, FILM_MM = 480, 360, 24.0
@@ -357,6 +359,72 @@ def test_a_georeferenced_picture_needs_no_table(towns, region, middle, tmp_path)
     assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.01)
     assert abs((truth.pose.yaw_deg + 180) % 360 - 180) < 0.01
     assert truth.measured["truth_sigma_m"] == 0.5
+
+
+def exif_of(region, place):
+    """GPS of EXIF at a place of the map."""
+    lon, lat = lonlat(region, *place)
+    parts = {}
+    for name, value, sides in (("Latitude", lat, "NS"), ("Longitude", lon, "EW")):
+        minutes = abs(value) * 60
+        whole = (int(minutes // 60), int(minutes % 60), (minutes % 1) * 60)
+        parts[getattr(ExifTags.GPS, f"GPS{name}")] = tuple(IFDRational(round(one * 1e6), 1_000_000) for one in whole)
+        parts[getattr(ExifTags.GPS, f"GPS{name}Ref")] = sides[value < 0]
+    return parts
+
+
+def test_photos_of_a_drone_need_no_table(towns, region, middle, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    told = {"RelativeAltitude": "+80.0", "GimbalYawDegree": "30", "GimbalPitchDegree": "-90", "GimbalRollDegree": "0"}
+    rtk = told | {"RtkStdLon": "0.011", "RtkStdLat": "0.013"}
+    gps = exif_of(region, middle)
+    write_photo(folder / "gps.jpg", gps=gps, xmp=xmp_of(told), focal=24)
+    write_photo(folder / "rtk.jpg", gps=gps, xmp=xmp_of(rtk), focal=24)
+    write_photo(folder / "loose.jpg", gps={}, xmp=xmp_of(told), focal=24)
+    write_photo(folder / "flat.jpg", gps=gps, xmp=xmp_of(told), focal=None)
+    request = ImportRequest(pictures=folder, region=towns / "regions" / TOWN, out=tmp_path / "out")
+    (task,), lines = quiet(request)
+    sigmas = sorted(truth.measured["truth_sigma_m"] for truth in task.truths)
+    assert sigmas == pytest.approx([math.hypot(0.013, 1.4), math.hypot(GPS_SIGMA_M, 1.4)], abs=0.01)
+    for query, truth in asked(task):
+        assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.05)
+        assert truth.pose.yaw_deg == pytest.approx(30.0 + north_of_grid(region, *middle), abs=0.01)
+        assert str(query.observed_on) == "2024-05-01"
+    assert "left out: 1 picture (loose.jpg) without a position" in lines
+    assert any("(flat.jpg) whose camera is not known (it has no focal length" in line for line in lines)
+
+
+def test_a_table_outdoes_the_file_but_not_a_picture_that_exif_turns(region, middle, laid):
+    """Where the clocks of both disagree, that is said."""
+    place = offset(middle, 50, 20)
+    times = {"a.jpg": "2024:05:01 10:20:30", "b.jpg": "2024:05:01 11:20:30", "turned.jpg": ""}
+    rows = [row(region, name, place, size=(400, 300), time=time) for name, time in times.items()]
+    request = laid(rows, without=set(times))
+    for name in times:
+        orientation = 6 if name == "turned.jpg" else None
+        write_photo(request.pictures / name, gps=exif_of(region, middle), orientation=orientation)
+    (task,), lines = quiet(request)
+    assert [(round(truth.pose.easting_m), round(truth.pose.northing_m)) for truth in task.truths] == [
+        (round(place[0]), round(place[1]))
+    ] * 2
+    assert any("(turned.jpg) that EXIF turns" in line for line in lines)
+    assert any(line.startswith("clocks disagree: the table is +3600 s (median) off EXIF at 1 of 2") for line in lines)
+
+
+def test_altitudes_above_the_ellipsoid_are_no_heights_above_the_sea(region, middle, laid, tmp_path):
+    dem, _ = slope(region, middle, tmp_path / "dem.tif", degrees=0.0)
+    request = laid([absolute(row(region, "a.png", middle), 280.0)], heights=Heights(dem=dem))
+    request.poses.write_text(request.poses.read_text().replace("RelativeAltitude", "ellipsoidal_height"))
+    with pytest.raises(ConfigError, match="counts from the ellipsoid, where the ground's heights do from the sea"):
+        quiet(request)
+    with pytest.raises(ConfigError, match="does not cover"):
+        quiet(laid([row(region, "a.png", middle)], heights=Heights(dem=slope_far(region, middle, tmp_path))))
+
+
+def slope_far(region, middle, folder):
+    """Heights of another place."""
+    return slope(region, offset(middle, 50_000, 0), folder / "far.tif", degrees=1.0)[0]
 
 
 # What is asked, error, its words.

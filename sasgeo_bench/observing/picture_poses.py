@@ -142,9 +142,7 @@ class PoseFacts:
         if self.epsg is not None:
             check_crs(self.epsg)
         if self.epsg is not None and self.origin is not None:
-            raise PoseError(
-                "a table has one frame: give the EPSG code of its CRS or the origin of its metres, not both"
-            )
+            raise PoseError("a table has one frame: say --epsg or --origin, not both")
         if self.pitch_zero not in (None, "down", "horizon"):
             raise PoseError(f"pitch_zero is down or horizon, got {self.pitch_zero!r}")
         if self.origin is not None:

@@ -426,7 +426,7 @@ def _crs_of(columns: _Columns) -> tuple[bool, int]:
     if stated is None:
         raise PoseError(
             f"{name} has columns {columns.title('east')} and {columns.title('north')} in a CRS that it does not state: "
-            "say its EPSG code"
+            "say --epsg"
         )
     return True, stated
 
@@ -438,7 +438,7 @@ def _pitch_zero(columns: _Columns) -> str | None:
         if not columns.sheet.kind.startswith("exiftool"):
             raise PoseError(
                 f"{columns.path.name} has a pitch in column {columns.title('pitch')} that may count from straight down "
-                "or from the horizon: say which (pitch_zero down or horizon)"
+                "or from the horizon: say --pitch-zero down or horizon"
             )
         columns.taken[f"not read: {columns.title('pitch')}, which is the camera's or the drone's, by maker"] += 1
     return zero

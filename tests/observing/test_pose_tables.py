@@ -226,7 +226,7 @@ def test_what_exiftool_prints_of_photos_is_what_the_photos_say(options, lay):
 
 HEAD = "# Image list with two lines of data per image:\n"
 LINE = "{} 1 0 0 0 0 0 0 1 {}\n"
-NO_FRAME = "in a frame that it does not state: say the EPSG code"
+NO_FRAME = "in a frame that it does not state: say --epsg"
 DAMAGED = "is damaged, or no list of images of COLMAP"
 MODEL, BINARY = cameras.colmap_text(SHIFTS, local()), cameras.colmap_binary(SHIFTS, local())
 UNKNOWN = "is no table of poses that is known (CSV with a header"
@@ -247,7 +247,7 @@ REFUSED = [
     ("broken.xml", "<document><chunk>", None, "is no sound XML"),
     ("bomb.xml", '<!DOCTYPE d [<!ENTITY a "b">]><document><chunk>&a;</chunk></document>', None, "is no sound XML"),
     ("unplaced.csv", "file,yaw\na.jpg,3\n", None, "has no columns of position (2 columns (file, yaw)): call them lat"),
-    ("grid.csv", "file,x,y\na.jpg,1,2\n", None, "columns x and y in a CRS that it does not state: say its EPSG code"),
+    ("grid.csv", "file,x,y\na.jpg,1,2\n", None, "columns x and y in a CRS that it does not state: say --epsg"),
     ("twice.csv", "file,lat,lat,lon\na.jpg,1,1,2\n", None, "2 columns (lat, lat) of one name, latitude"),
     ("pitch.csv", "file,lat,lon,yaw,pitch,roll\na.jpg,1,2,3,4,5\n", None, "may count from straight down or from the"),
     ("bare.csv", "a.jpg,1,2,3,4,5,6\n", None, "has 7 columns and no header: write one, such as imageName,latitude"),

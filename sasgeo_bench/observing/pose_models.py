@@ -85,8 +85,8 @@ def _frame_of(path: Path, facts: PoseFacts, kind: str) -> ModelFrame:
     if facts.origin is not None:
         return ModelFrame(origin=facts.origin, has_height=facts.origin[2] != 0)
     raise PoseError(
-        f"{plain(path.name)} ({kind}) has positions in a frame that it does not state: say --epsg of its projected CRS, "
-        "or --origin LON,LAT,HEIGHT if it has metres to the east, to the north and up"
+        f"{plain(path.name)} ({kind}) has positions in a frame that it does not state: say --epsg of its projected "
+        "CRS, or --origin LON,LAT,HEIGHT if it has metres to the east, to the north and up"
     )
 
 
@@ -543,8 +543,8 @@ def read_tum_poses(path: Path, facts: PoseFacts) -> Read:
         names = list(facts.names)
         if len(names) != len(flown):
             raise PoseError(
-                f"{path.name} has {counted(len(flown), 'pose')} for {counted(len(names), 'picture')}: give the pictures of "
-                "this file alone, or say when each was taken"
+                f"{path.name} has {counted(len(flown), 'pose')} for {counted(len(names), 'picture')}: give the "
+                "pictures of this file alone, or say when each was taken"
             )
     else:
         raise PoseError(f"{path.name} (TUM) names no pictures: give their names in its order, or their times")

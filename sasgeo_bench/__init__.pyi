@@ -3,6 +3,7 @@
 
 from .boards.board import StoredBoard as StoredBoard
 from .boards.board import read_board as read_board
+from .boards.cases import plot_evidence as plot_evidence
 from .boards.cases import plot_query as plot_query
 from .cli.boards import score as score
 from .cli.importing_photos import import_photos as import_photos
@@ -10,9 +11,11 @@ from .cli.observing import locate as locate
 from .cli.publishing import publish as publish
 from .cli.queries import make_tasks as make_tasks
 from .cli.regions import build_region as build_region
+from .cli.regions import new_region as new_region
 from .cli.regions import propose_regions as propose_regions
 from .cli.regions import render_imagery as render_imagery
 from .cli.runs import run as run
+from .cli.splits import new_split as new_split
 from .core.storage import fetch as fetch
 from .core.storage import send as send
 from .core.texts import MOST_CANDIDATES as MOST_CANDIDATES

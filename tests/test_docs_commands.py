@@ -44,6 +44,7 @@ DOCUMENTS = (
 ONLY_PARSED = {
     r"vaduz|liechtenstein": "needs an extract of Liechtenstein",
     r"--extracts|--extract ": "needs extracts",
+    r"^sasgeo-bench new-region |my-place": "needs extracts; tests/regions/test_new_region.py makes some",
     r"--imagery|zanzibar": "needs aerial pictures; tests/regions/test_imagery.py makes some",
     r"^sasgeo-bench leaderboard (?!.*--dry-run)": "too long; tests/experiments/test_pipeline.py does a small one",
     r"(check|--matcher|runs/) ?my-tracker": "half a minute; tests/running/test_tracker_testing.py flies it",
@@ -74,6 +75,7 @@ OTHERS = {
     r"^pip install -e my-(matcher|segmenter|tracker|suite|metric|stress)$": "by hand: it needs the package registry",
     r"^python -c .import pandas; print": "reads stored results of the checkout, which a desk of tests lacks",
     r"^(sha256sum |install -m 600 |source \.venv/bin/activate$)": "programs of the system, and of the shell",
+    r"^'?\(cd'? my-tiles ": "programs of the system; tests/regions/test_tiles.py holds what they print",
     r"^podman ": "downloads and builds an image; tests/test_repository.py reads what it is built by",
     r"^bash findings/": "installs packages from the registry",
     r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",

@@ -185,7 +185,7 @@ def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: 
     (wheel,) = WheelBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
     names = set(zipfile.ZipFile(wheel).namelist())
     files = ("py.typed", "__init__.pyi", "osm/taxonomy.toml", "ageing/ratebook.toml", "cli/program.py")
-    files += ("exchange/importers/regional_extracts.toml",)
+    files += ("osm/regional_extracts.toml",)
     expected = {f"sasgeo_bench/{name}" for name in files}
     templates = (ROOT / "sasgeo_bench" / "boards" / "templates").iterdir()
     expected |= {f"sasgeo_bench/boards/templates/{path.name}" for path in templates}

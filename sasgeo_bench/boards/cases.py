@@ -51,10 +51,10 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.boards.tables import prior_words
 from sasgeo_bench.core.canvas import GREY, Page, new_figure, styled, without_ticks
-from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, check_given
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, check_given, counted
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
-from sasgeo_bench.regions.evidence import Evidence, LayerBits, footprint, observe
+from sasgeo_bench.regions.evidence import CERTAIN, UNKNOWN, Evidence, LayerBits, footprint, observe
 from sasgeo_bench.regions.layers import PRESENT
 from sasgeo_bench.regions.preview import GROUND, class_keys, paint_overview, pooled, scale_bar
 from sasgeo_bench.regions.region import Manifest, Region
@@ -622,6 +622,67 @@ def plot_query(query: Query, region: Region, truth: Truth | None = None) -> Figu
         at = [(pose.easting_m - case.part.west_m, pose.northing_m - case.part.south_m) for pose in query.candidates]
         if at:
             large.plot(*np.transpose(at), color=_CANDIDATE, marker="x", ms=5, ls="")
+        figure.arrange()
+    return figure
+
+
+def plot_evidence(evidence: Evidence, *, title: str = "evidence of one view", data: str = "not stated") -> Figure:
+    """Draw what was seen in one view: the classes in their colours, and beside them how much is known.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        What a segmenter, a mask or a view of the map says: `query.evidence`, or `Evidence.of_probabilities`.
+    title, data : str
+        What stands above, and whose data it is, below.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure of its own. The first panel is the view, up is where the camera looked; of evidence with a confidence
+        the second one is the mean confidence of its known classes.
+
+    Raises
+    ------
+    ConfigError
+        If it is no evidence.
+
+    Examples
+    --------
+    >>> chance = np.array([[[0.9, 0.2, np.nan]]])
+    >>> figure = plot_evidence(Evidence.of_probabilities(("water",), chance, cell_size_m=2.0))
+    >>> [chart.get_title("left") for chart in figure.axes]
+    ['view, 6 m across', 'confidence, mean of the known classes']
+    """
+    check_given(evidence, Evidence, "query.evidence is one, or make it by Evidence.of_probabilities")
+    rows, cols = evidence.shape
+    width_m, height_m = cols * evidence.cell_size_m, rows * evidence.cell_size_m
+    shown = {name for name, cells in zip(evidence.classes, evidence.cells, strict=True) if (cells == PRESENT).any()}
+    known = evidence.cells != UNKNOWN
+    facts = (
+        f"{rows} x {cols} cells of {evidence.cell_size_m:g} m, {counted(len(evidence.classes), 'class', 'classes')}, "
+        f"{evidence.unknown_share:.0%} unknown"
+    )
+    count = 1 if evidence.confidence is None else 2
+    with styled():
+        figure = new_figure((count * _MAP_INCHES + 0.6, _MAP_INCHES + 1.6))
+        about = Page(title=title, facts=facts, data=data, keys=evidence_keys(shown), columns=2 * count)
+        charts = figure.framed(about).subplots(1, count, squeeze=False)[0]
+        extent = (0.0, width_m, 0.0, height_m)
+        charts[0].imshow(paint(evidence), extent=extent, interpolation="nearest")
+        charts[0].set_title(f"view, {width_m:.0f} m across", fontsize=7.5)
+        scale_bar(charts[0], width_m, height_m)
+        if evidence.confidence is not None:
+            sure = np.where(known, evidence.confidence / CERTAIN, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+            hidden = np.ma.masked_array(sure, mask=~known.any(axis=0))
+            charts[1].set_facecolor(HIDDEN)
+            drawn = charts[1].imshow(hidden, extent=extent, vmin=0, vmax=1, cmap="cividis", interpolation="nearest")
+            charts[1].set_title("confidence, mean of the known classes", fontsize=7.5)
+            bar = charts[1].inset_axes((1.03, 0, 0.04, 1))
+            charts[1].figure.colorbar(drawn, cax=bar)
+            bar.tick_params(labelsize=6.5)
+        for chart in charts:
+            without_ticks(chart)
         figure.arrange()
     return figure
 

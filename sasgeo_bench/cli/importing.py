@@ -2,7 +2,7 @@
 """Commands about datasets of other benchmarks: import one, score a ranking of it, find the map under it."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from rich.table import Table
@@ -15,6 +15,7 @@ from sasgeo_bench.exchange.importers.items import Dataset, Role
 from sasgeo_bench.exchange.importers.kinds import IMPORTERS, read_dataset
 from sasgeo_bench.exchange.importers.reports import Report
 
+MOST: Final = 3  # regional extracts that are named for an area: its box may lie in those of neighbours
 Folder = Annotated[Path, typer.Argument(help="folder of the dataset; it is only read")]
 Kind = Annotated[str, typer.Option(help=f"kind of the dataset: {', '.join(IMPORTERS)}")]
 
@@ -61,7 +62,7 @@ def locate_dataset_command(folder: Folder, *, kind: Kind, regions: RegionFolders
             f"[{centre.longitude_deg:.4f}, {centre.latitude_deg:.4f}]",
             f"{extent.width_km:.1f} x {extent.height_km:.1f}",
             ",".join(f"{side:.4f}" for side in (box.west_deg, box.south_deg, box.east_deg, box.north_deg)),
-            *(", ".join(names) or "-" for names in (extent.covered_by, extent.touched_by, extent.extracts)),
+            *(", ".join(names) or "-" for names in (extent.covered_by, extent.touched_by, extent.extracts[:MOST])),
         )
     print_table(table)
     tell(

@@ -34,6 +34,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "doctor": "doctor",
     },
     "Regions": {
+        "new-region": "regions",
         "propose-regions": "regions",
         "build-region": "regions",
         "render-imagery": "regions",
@@ -44,6 +45,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "import-photos": "importing_photos",
     },
     "Queries": {
+        "new-split": "splits",
         "make-queries": "queries",
         "segment": "segmenters",
         "inspect": "looking",
@@ -96,6 +98,7 @@ ALIASES: Final = {
 
 # Command -> what is kept of it when it is interrupted, and how to go on; the others write all or nothing.
 KEPT: Final = {
+    "new-region": "what was downloaded is kept; the same command goes on from there",
     "propose-regions": "files that were written are kept; the same command writes the others",
     "build-region": "regions that were built are kept; the same command builds the others",
     "render-imagery": "images that were rendered are kept; the same command renders the others",

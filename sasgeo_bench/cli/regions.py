@@ -3,16 +3,19 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar, cast
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar, cast
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.core.errors import ConfigError, SasgeoError, named
+from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, counted, named
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
@@ -23,6 +26,7 @@ from sasgeo_bench.sensing.rendering.palettes import PALETTES
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 
 if TYPE_CHECKING:
+    from sasgeo_bench.regions.new_region import Place
     from sasgeo_bench.sensing.rendering.palettes import Family
     from sasgeo_bench.sensing.rendering.seasons import Season
 
@@ -82,7 +86,7 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
         build.plan_build,
         out=options.out,
         date=read_date(options.date),
-        extract_folders=options.extracts or (),
+        extract_folders=(*(options.extracts or ()), *_own_folders(options)),
         imagery_folders=options.imagery or (),
         with_preview=True,
     )
@@ -121,6 +125,12 @@ def _attempt(name: str, work: Callable[[], Result]) -> Result | None:
         return None
 
 
+def _own_folders(options: BuildOptions) -> list[Path]:
+    """Return the folders of the user's own region files: extracts that were cut for them lie there."""
+    named_files = [Path(name).parent for name in options.region or () if name.endswith(".toml")]
+    return list(dict.fromkeys([*(options.region_files or ()), *named_files]))
+
+
 def _wanted(options: BuildOptions) -> dict[str, RegionFile | None]:
     """Return the regions to build, by name; None, and a line, for one of `every` that cannot be read."""
     folders = options.region_files or ()
@@ -136,6 +146,128 @@ def _wanted(options: BuildOptions) -> dict[str, RegionFile | None]:
     if not paths:
         raise ConfigError(f"{', '.join(map(str, folders))}: no region file (*.toml) to build")
     return {path.stem: _attempt(path.stem, partial(read_region_file, path)) for path in paths}
+
+
+PHOTOS: Final = (".jpg", ".jpeg", ".tif", ".tiff", ".dng")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewRegionOptions(Options):
+    """Flags of new-region."""
+
+    name: Annotated[str, typer.Argument(help="id of the region, such as my-town")] = field(kw_only=False)
+    center: Annotated[str | None, typer.Option(help="LON,LAT of its middle, degrees; with --size")] = None
+    size: Annotated[str | None, typer.Option(help="of its sides, such as 2km, 800m or 2x3km (width x height)")] = None
+    bounds: Annotated[str | None, typer.Option(help="W,S,E,N, degrees; instead of --center")] = None
+    photos: Annotated[
+        Path | None, typer.Option(help="folder of photos: the place is where they are, and 500 m around")
+    ] = None
+    country: Annotated[str | None, typer.Option(help="country of the place, for its provenance and for splits")] = None
+    date: Annotated[
+        str | None, typer.Option(help="YYYY, YYYY-MM or YYYY-MM-DD: take the extract nearest to it; default: newest")
+    ] = None
+    keep_cut: Annotated[
+        bool, typer.Option("--keep-cut", help="cut the place out of its extract, and write the cut beside the file")
+    ] = False
+    extracts: ExtractFolders = None
+    into: Annotated[Path, typer.Option(help="folder to write the region file into")] = Path("my-regions")
+    most_mb: Annotated[
+        float, typer.Option(min=0, help="largest regional extract to download where none is at hand, MB; 0: none")
+    ] = 500.0
+
+
+@takes(NewRegionOptions)
+def new_region(options: NewRegionOptions) -> Path:
+    """Write the region file of a place: the newest extract at hand that covers it, and the kinds of its ground.
+
+    Where none covers it, the line of the error names the regional extract to get; it is downloaded where there is a
+    network. A file that is there already stays as it is.
+
+    Returns
+    -------
+    Path
+        The region file, `into/name.toml`, as `build_region` takes it.
+
+    Raises
+    ------
+    ConfigError
+        If the place is not given once, cannot be read or lies in two.
+    ExtractError
+        If no extract covers the place.
+    StoreError
+        If a file cannot be written, or is there and is of another region.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> sgb.new_region("my-town", center="47.15,109.52", size="2km")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.core.errors.ConfigError: LON,LAT are degrees, and no latitude lies beyond 90, got '47.15,109.52': longitude comes first
+    """  # noqa: E501 - an error is one line
+    from sasgeo_bench.regions import new_region as one_region  # noqa: PLC0415 - build-region needs none
+
+    folders = options.extracts or []
+    path = one_region.new_region(
+        options.name,
+        replace(_place(options), country=options.country),
+        into=options.into,
+        folders=folders,
+        days=one_region.Days.read(options.date) if options.date else None,
+        keep_cut=options.keep_cut,
+        most_mb=options.most_mb,
+    )
+    options.say(path)
+    more = "".join(f" --extracts {quote(str(folder))}" for folder in folders) if not options.keep_cut else ""
+    tell(f"build it: sasgeo-bench build-region {quote(str(path))}{more}")
+    return path
+
+
+def _place(options: NewRegionOptions) -> "Place":
+    from sasgeo_bench.regions.new_region import Place  # noqa: PLC0415 - as above
+
+    ways = [options.center is not None, options.bounds is not None, options.photos is not None]
+    if sum(ways) != 1 or (options.size is not None) != (options.center is not None):
+        raise ConfigError("say where the region lies by --center LON,LAT and --size 2km, by --bounds, or by --photos")
+    if options.center is not None:
+        return Place.around(options.center, options.size or "")
+    if options.bounds is not None:
+        return Place.within(options.bounds)
+    return Place.of_points(_taken_at(options.photos or Path()))
+
+
+def _taken_at(folder: Path) -> NDArray[np.float64]:
+    """Return longitude and latitude of the photos of a folder; a line names those that do not say theirs."""
+    from sasgeo_bench.sensing.photos import read_photo  # noqa: PLC0415 - as above
+
+    if not folder.is_dir():
+        what = "is a file: unpack it, and name the folder" if folder.exists() else "is not there: check the path"
+        raise ConfigError(f"{folder} {what} of the photos")
+    paths = sorted(path for path in folder.iterdir() if path.name.lower().endswith(PHOTOS))
+    if not paths:
+        raise ConfigError(f"{folder} holds no photo ({', '.join(PHOTOS)}): name the folder that they lie in")
+    lonlat, without, broken = [], [], []
+    for path in paths:
+        try:
+            photo = read_photo(path)
+        except ImageError as error:
+            broken.append(error)
+            continue
+        if photo.lon_deg is None or photo.lat_deg is None:
+            without.append(path.name)
+        else:
+            lonlat.append((photo.lon_deg, photo.lat_deg))
+    if broken:
+        tell(f"{counted(len(broken), 'photo')} of {len(paths)} cannot be read: {broken[0]}")
+    if without:
+        tell(f"{named(without, 'photo')} of {len(paths)} without a position")
+    return np.array(lonlat, dtype=np.float64).reshape(-1, 2)
+
+
+def new_region_command(options: NewRegionOptions) -> None:
+    """Write the region file of a place: INTO/NAME.toml, from the newest extract at hand that covers it."""
+    with shown_progress():
+        new_region(**vars(options) | {"say": say})
 
 
 @dataclass(frozen=True, kw_only=True)

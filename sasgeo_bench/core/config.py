@@ -132,6 +132,15 @@ def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
     return check_document(content, model, source=source)
 
 
+def toml_value(value: object) -> str:
+    """Return a text, a number, a truth value, or a list of them, as TOML writes it: as JSON does.
+
+    >>> toml_value(["Köln", 1.0, True])
+    '["Köln", 1.0, true]'
+    """
+    return json.dumps(value, ensure_ascii=False)
+
+
 def check_document(content: object, model: type[Model], *, source: str) -> Model:
     """Validate the content of a file, whatever its format; raise `ConfigError` as `parse_toml` does."""
     try:

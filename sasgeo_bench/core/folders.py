@@ -145,6 +145,20 @@ def fresh_file(path: Path, *, mend: str) -> Iterator[Path]:
         raise StoreError(f"{path} cannot be written ({error.strerror or error}): {mend}") from error
 
 
+def check_free(path: Path, text: str) -> bool:
+    """Return whether a text can be written to a path: False if it is there already, with a line.
+
+    Raise `StoreError` if anything else is there.
+    """
+    if not os.path.lexists(path):
+        return True
+    with suppress(OSError, UnicodeDecodeError):
+        if plain_file(path).read_text(encoding="utf-8") == text:
+            tell(f"{path} is there already")
+            return False
+    raise StoreError(f"{path} is there, and says something else: remove it, or choose another name or folder (--into)")
+
+
 def check_no_folder(path: Path) -> None:
     """Raise `OSError` if a folder, "." included, has the path that a file is to get."""
     if path.is_dir():

@@ -14,13 +14,14 @@ import shapely
 from sasgeo_bench.core.errors import ExtractError, counted, named
 from sasgeo_bench.core.json import MOST_BYTES, parse_json
 from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.geometry.projection import WGS84
 from sasgeo_bench.osm.multipolygons import MIN_RING_POINTS
 from sasgeo_bench.osm.scan import BUILT_UP, Box, Classifier, Get, Scan, ScanRow
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy
 from sasgeo_bench.osm.xml_text import NEW_IDS
 
-_NO_TIME: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
-_WGS84: Final = re.compile(r"(.*[:/])?(CRS84h?|4326|WGS ?84)", re.IGNORECASE)  # names in files before RFC 7946
+NO_TIME: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+_LONLAT: Final = re.compile(r"(.*[:/])?(CRS84h?|4326|WGS ?84)", re.IGNORECASE)  # names in files before RFC 7946
 _MORE_TAGS: Final = ("all_tags", "other_tags", "tags")
 _NO_TAGS: Final = (*_MORE_TAGS, "osm_id", "osm_way_id", "osm_type", "version", "timestamp", "type", "id", "@id")
 _NUMBERS: Final = ("layer", "level", "width", "lanes", "height")  # of which 0 and 1 are values
@@ -74,7 +75,7 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
     frame = shapely.box(*box)
     found: list[_Found] = []
     for path in files:
-        features = list(_features(path))
+        features = list(features_of(path))
         is_ogr = any("osm_way_id" in _properties(feature) for feature in features)
         for number, feature in enumerate(features):
             shape = _shape(feature, path, number)
@@ -149,8 +150,12 @@ def classless(scan: Scan) -> str:
     )
 
 
-def _features(path: Path) -> Iterator[Any]:
-    """Yield the features of a file, after a check of its form and its coordinate reference system."""
+def features_of(path: Path, *, epsg: int | None = None) -> Iterator[Any]:
+    """Yield the features of a file, after a check of its form and its coordinate reference system.
+
+    It is longitude and latitude (RFC 7946), unless the user says which one by `epsg`. Raise `ExtractError` if the file
+    is no FeatureCollection, or says another one.
+    """
     if path.stat().st_size > MOST_BYTES:
         raise ExtractError(f"{path} has more than {MOST_BYTES / 1e6:.0f} MB: cut it to the region")
     text = b""
@@ -166,10 +171,9 @@ def _features(path: Path) -> Iterator[Any]:
     if not isinstance(features, list) or content.get("type") != "FeatureCollection":
         raise ExtractError(f"{path} is no GeoJSON FeatureCollection: export the features of OpenStreetMap as one")
     crs = content.get("crs")
-    if crs is not None and not _is_lonlat(crs):
-        raise ExtractError(
-            f"{path} is in {json.dumps(crs)[:100]}, GeoJSON is in longitude and latitude: reproject it to EPSG:4326"
-        )
+    if crs is not None and not _is_of(crs, epsg):
+        what = "GeoJSON is in longitude and latitude" if epsg is None else f"its [[own_map]] says epsg = {epsg}"
+        raise ExtractError(f"{path} is in {json.dumps(crs)[:100]}, {what}: reproject it to EPSG:{epsg or WGS84}")
     for number, feature in enumerate(features):
         properties = feature.get("properties") if isinstance(feature, dict) else None
         if not isinstance(properties, dict | None):
@@ -187,10 +191,13 @@ def _is_sequence(text: bytes) -> bool:
     return first.startswith(b"\x1e") or (is_line and rest.lstrip().startswith(b"{"))
 
 
-def _is_lonlat(crs: Any) -> bool:  # noqa: ANN401 - what a file holds
+def _is_of(crs: Any, epsg: int | None) -> bool:  # noqa: ANN401 - what a file holds
+    """Return whether the member `crs` of a file names a CRS; None is longitude and latitude."""
     members = crs.get("properties", crs) if isinstance(crs, dict) else {"name": crs}
     name = members.get("name", members.get("code")) if isinstance(members, dict) else None
-    return _WGS84.fullmatch(str(name)) is not None
+    if epsg in (None, WGS84):
+        return _LONLAT.fullmatch(str(name)) is not None
+    return re.search(rf"(^|\D){epsg}$", str(name)) is not None
 
 
 def _properties(feature: object) -> Mapping[str, object]:
@@ -199,19 +206,28 @@ def _properties(feature: object) -> Mapping[str, object]:
 
 def _shape(feature: Any, path: Path, number: int) -> shapely.Geometry | None:  # noqa: ANN401 - what a file holds
     """Return the geometry of a feature, mended where its rings cross; None if it has none."""
+    shape = shape_of(feature, path, number)
+    if shape is None or shape.is_valid:
+        return shape
+    return shapely.make_valid(shape, method="structure", keep_collapsed=False)
+
+
+def shape_of(feature: Any, path: Path, number: int, *, is_lonlat: bool = True) -> shapely.Geometry | None:  # noqa: ANN401 - what a file holds
+    """Return the geometry of a feature as it is; None if it has none.
+
+    Raise `ExtractError`, which names the feature by its number, if it is broken, or not in longitude and latitude.
+    """
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     if geometry is None and isinstance(feature, dict):
         return None
     try:
         shape = shapely.geometry.shape(geometry)
-        fault = _fault(shape)
+        fault = _fault(shape) if is_lonlat else ""
     except (ValueError, TypeError, AttributeError, KeyError, IndexError, shapely.errors.ShapelyError) as error:
         fault = str(error)[:200] or "no geometry"
     if fault:
         raise ExtractError(f"{path}: feature {number} has a broken geometry ({fault}): remove or mend it")
-    if shape.is_empty:
-        return None
-    return shape if shape.is_valid else shapely.make_valid(shape, method="structure", keep_collapsed=False)
+    return None if shape.is_empty else shape
 
 
 def _fault(shape: shapely.Geometry) -> str:
@@ -361,11 +377,11 @@ def _take(
     kind = classifier.kind(get, labels, is_area=is_area)
     if identity is None:
         scan.tally.notes["feature without the id of an object"] += 1
-        scan.rows.append(ScanRow(wkb, kind, -1 - len(scan.rows), False, 0, _NO_TIME))  # noqa: FBT003
+        scan.rows.append(ScanRow(wkb, kind, -1 - len(scan.rows), False, 0, NO_TIME))  # noqa: FBT003
         return
     place = parts.setdefault((identity, kind), len(scan.rows))
     if place == len(scan.rows):
-        scan.rows.append(ScanRow(wkb, kind, identity.osm_id, identity.is_relation, 0, _NO_TIME))
+        scan.rows.append(ScanRow(wkb, kind, identity.osm_id, identity.is_relation, 0, NO_TIME))
         return
     before = shapely.from_wkb(scan.rows[place].wkb)
     if shapely.covers(before, shape):

@@ -76,7 +76,7 @@ class Extract(Document):
     sha256: Annotated[tuple[Sha256, ...], Field(strict=False)] = ()
     urls: Annotated[tuple[str, ...], Field(strict=False)] = ()
     town: TownEntry | None = None
-    format: Literal["osm", "geojson"] = "osm"
+    format: Literal["osm", "geojson", "own_map"] = "osm"
     tags: dict[str, Line] = {}
     also: Annotated[tuple[ExtractPart, ...], Field(strict=False)] = ()
 
@@ -120,9 +120,10 @@ def imagery_folders(given: Sequence[Path] = (), *, extracts: Sequence[Path] = ()
     return (*given, *named, *(folder.parent / "imagery" for folder in extract_folders(extracts)[:-1]))
 
 
-def named_files(name: str, folders: Sequence[Path]) -> list[Path]:
-    """List the files of a name in folders and in the folders directly below them, in order."""
-    return [path for folder in folders for path in (folder / name, *sorted(folder.glob(f"*/{name}"))) if path.is_file()]
+def named_files(name: str, folders: Sequence[Path], *, has_folders: bool = False) -> list[Path]:
+    """List the files of a name in folders and in the folders directly below them, in order; folders of it, too."""
+    found = (path for folder in folders for path in (folder / name, *sorted(folder.glob(f"*/{name}"))))
+    return [path for path in found if path.is_file() or (has_folders and path.is_dir())]
 
 
 def cache_folder() -> Path:
@@ -135,8 +136,9 @@ def cache_folder() -> Path:
 def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
     """Find the file of an extract by name and SHA-256, or download it into the user's cache; `folders` come first.
 
-    GeoJSON, which comes with imagery, is looked for in the folders of imagery too. Raise `ExtractError` if no folder
-    holds the file and it cannot be downloaded; the message names the file, its SHA-256 and where to put it.
+    GeoJSON and maps of one's own, which come with imagery, are looked for in the folders of imagery too. Raise
+    `ExtractError` if no folder holds the file and it cannot be downloaded; the message names the file, its SHA-256 and
+    where to put it.
     """
     if not extract.sha256:
         raise ExtractError(f"{extract.file} is an embedded town: it is made by the build, there is no file to find")
@@ -159,9 +161,7 @@ def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
 def _places(extract: Extract, folders: Sequence[Path]) -> list[Path]:
     """Return where the file of an extract may lie on this machine."""
     places = [folder / extract.file for folder in extract_folders(folders)]
-    return places + (
-        named_files(extract.file, imagery_folders(extracts=folders)) if extract.format == "geojson" else []
-    )
+    return places + (named_files(extract.file, imagery_folders(extracts=folders)) if extract.format != "osm" else [])
 
 
 def missing_files(extracts: Iterable[Extract], *, folders: Sequence[Path] = ()) -> tuple[str, ...]:

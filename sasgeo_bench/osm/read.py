@@ -27,6 +27,7 @@ from sasgeo_bench.osm.mapped import Mapped, box_text, find_shore, lonlat_box, ma
 from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Scan, ScanRow, Traits, scan_file
 from sasgeo_bench.osm.snapshot import Snapshot, elements, open_snapshot, own_id
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
+from sasgeo_bench.osm.vector import ClassTable, scan_vector
 
 # Lines with the trait "through" lead somewhere: where they end at the edge of the data, the extract was cut there. Of
 # 191 extracts with a box, those cut along a border have 2 to 11 such ends beyond the estimated area, or more than 0.38
@@ -250,6 +251,14 @@ def read_geojson(
     mapped = _mapped(name, scan, grid, area=stated_coverage, source="region file", frame=_frame(objects))
     warning = classless(scan)
     return _reading(name, scan, grid, mapped, objects=objects, classes=classes, warnings=(warning,) if warning else ())
+
+
+def read_vector(path: Path, grid: Grid, *, table: ClassTable, stated_coverage: shapely.Geometry) -> Reading:
+    """Read a map of one's own by its table of classes, as `read_extract` reads an OSM file; raise as `scan_vector`."""
+    scan, warnings = scan_vector(path, load_taxonomy(), table, grid=grid)
+    objects, name = _objects(scan), path.name
+    mapped = _mapped(name, scan, grid, area=stated_coverage, source="region file", frame=_frame(objects))
+    return _reading(name, scan, grid, mapped, objects=objects, classes=table.named_classes, warnings=warnings)
 
 
 def misdated(

@@ -27,6 +27,8 @@ _PBF_MARK: Final = b"\n\tOSMHeader"  # after four bytes of length
 _MOST_QUOTED: Final = 200  # characters of an error of osmium, which quotes a value of any length
 _GZIP_MARK: Final = b"\x1f\x8b"
 _BZIP2_MARK: Final = b"BZh"
+_EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium returns 1970-01-01 for an object without a time
+_MOST_FEATURES: Final = 16  # that a header lists; all known ones are four
 OBJECTS: Final = osmium.osm.NODE | osmium.osm.WAY | osmium.osm.RELATION  # changesets have no versions
 
 
@@ -46,10 +48,14 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
-    """Boxes (west, south, east, north, degrees) and date of a file's header; there may be none."""
+    """Boxes (west, south, east, north, degrees) and date of a file's header; there may be none.
+
+    `is_history` says that the file states to hold all versions of its objects; an XML file never does.
+    """
 
     boxes_lonlat: tuple[Box, ...]
     replicated_at: dt.datetime | None
+    is_history: bool = False
 
 
 def read_header(path: Path) -> Header:
@@ -58,6 +64,24 @@ def read_header(path: Path) -> Header:
     with _readable(path), scratch_folder("map") as scratch:
         content = _as_its_content(path, scratch)
         return _header(path, content)
+
+
+def read_extent(path: Path) -> Header:
+    """Read all objects of an extract for what its header may lack: the box of its nodes and its newest time.
+
+    Of a full history all versions count. Raise `ExtractError` as `open_snapshot` does.
+    """
+    _check_file(path)
+    with _readable(path), scratch_folder("map") as scratch:
+        content = _as_its_content(path, scratch)
+        places, newest = array("d"), _EPOCH
+        for item in elements(osmium.FileProcessor(str(content), OBJECTS)):
+            newest = max(newest, item.timestamp)
+            if item.is_node() and item.location.valid():
+                places.extend((item.lon, item.lat))
+    lonlat = np.array(places, dtype=np.float64).reshape(-1, 2)
+    box = (*lonlat.min(axis=0).tolist(), *lonlat.max(axis=0).tolist()) if len(lonlat) else None
+    return Header(boxes_lonlat=(box,) if box else (), replicated_at=newest if newest > _EPOCH else None)
 
 
 @contextmanager
@@ -235,7 +259,11 @@ def _header(path: Path, content: Path) -> Header:
             f"{path.name} holds changes: give the extract, with the changes applied (osmium apply-changes)"
         )
     boxes = read_boxes(path) if _is_xml(content) else _header_boxes(header)  # osmium gives the first of several alone
-    return Header(boxes_lonlat=boxes, replicated_at=_header_time(header))
+    return Header(
+        boxes_lonlat=boxes,
+        replicated_at=_header_time(header),
+        is_history=header.has_multiple_object_versions,
+    )
 
 
 def _header_boxes(header: osmium.io.Header) -> tuple[Box, ...]:
@@ -284,13 +312,17 @@ def _survey(path: Path) -> _Survey:
         return _Survey(is_flagged=True)
     kinds, ids, versions = array("q"), array("q"), array("q")
     deleted, has_places = 0, False
+    # A PBF file says so in its header if ways may carry places: to look at all their nodes takes longer than all else
+    features = {header.get(f"pbf_optional_feature_{number}") for number in range(_MOST_FEATURES)}
+    may_have_places = _is_xml(path) or "LocationsOnWays" in features
     wanted = osmium.osm.WAY | osmium.osm.RELATION if header.get("sorting") == "Type_then_ID" else OBJECTS
     for item in elements(osmium.FileProcessor(str(path), wanted)):
         kinds.append(("n", "w", "r").index(item.type_str()))  # in osmium's order
         ids.append(item.id)
         versions.append(item.version)
         deleted += not item.visible
-        has_places = has_places or (item.is_way() and any(node.location.valid() for node in item.nodes))
+        if may_have_places and not has_places and item.is_way():
+            has_places = any(node.location.valid() for node in item.nodes)
     number = np.array(ids, dtype=np.int64)
     # osmium's order: by type, negative ids first, then by the size of the id.
     keys = np.column_stack((np.array(kinds, dtype=np.int64), number > 0, np.abs(number)))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from importlib import metadata
 from pathlib import Path
 from typing import Final
@@ -27,7 +27,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.locate import Extract, find_extract, find_parts
 from sasgeo_bench.osm.mapped import lonlat_box
-from sasgeo_bench.osm.read import Reading, read_extract, read_geojson
+from sasgeo_bench.osm.read import Reading, read_extract, read_geojson, read_vector
 from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
@@ -37,7 +37,6 @@ from sasgeo_bench.regions.layers import PaintWindow, burn, burn_mapped, make_pai
 from sasgeo_bench.regions.ortho import Picture, check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.region import (
     DATA_VERSION,
-    LICENCE,
     SCHEMA_VERSION,
     CoverageRecord,
     ExtractRecord,
@@ -237,6 +236,8 @@ def _read(plan: BuildPlan, source: Path) -> Reading:
     """Read the extract, and beside it each map of one's own for the classes that it gives."""
     spec = plan.spec
     stated, grid = spec.stated_coverage(), plan.grid
+    if stated is not None and spec.is_own_alone:
+        return reduce(Reading.beside, _read_own_maps(plan, stated))
     if stated is not None and (plan.extract.format == "geojson" or spec.own_map):
         of_geojson = partial(read_geojson, grid=grid, stated_coverage=stated)
         classes = spec.extract_classes
@@ -244,10 +245,16 @@ def _read(plan: BuildPlan, source: Path) -> Reading:
             reading = of_geojson((source, *plan.more), tags=plan.extract.tags, classes=classes)
         else:
             reading = read_extract(source, grid, at=plan.extract.date, stated_coverage=stated, classes=classes)
-        for one, path in zip(spec.own_map, plan.own_maps, strict=True):
-            reading = reading.beside(of_geojson((path,), tags=one.tags, classes=one.classes))
-        return reading
+        return reduce(Reading.beside, _read_own_maps(plan, stated), reading)
     return read_extract(source, grid, at=plan.extract.date, stated_coverage=stated, classes=spec.classes)
+
+
+def _read_own_maps(plan: BuildPlan, stated: shapely.Geometry) -> Iterator[Reading]:
+    for own, path in zip(plan.spec.own_map, plan.own_maps, strict=True):
+        if own.named_classes:
+            yield read_vector(path, plan.grid, table=own, stated_coverage=stated)
+        else:
+            yield read_geojson((path,), plan.grid, tags=own.tags, stated_coverage=stated, classes=own.classes)
 
 
 def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading) -> OrthoRecord:
@@ -292,13 +299,13 @@ def _write_into(
     imagery: OrthoRecord | None = None,
 ) -> Manifest:
     """Burn the layers, make the graph, and write all files of a region."""
-    classes, credit = plan.spec.class_names, plan.spec.origin.credit
+    classes, terms = plan.spec.class_names, {"credit": plan.spec.credit, "licence": plan.spec.licence}
     # GDAL packs blocks without holding the interpreter, so the layers are written while the graph is made.
     with ThreadPoolExecutor(max_workers=1) as executor:
         paint = partial(_painter, reading, plan.grid, classes)
-        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint, credit=credit)
+        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint, **terms)
         graph = build_graph(reading.features, bounds_m=plan.grid.bounds_m)
-        region_files.write_tables(scratch, reading.features, graph, credit=credit)
+        region_files.write_tables(scratch, reading.features, graph, **terms)
         manifest = make_manifest(plan, extract, reading, graph)
         layers.result()
     if plan.with_preview:
@@ -395,7 +402,7 @@ def _mend(plan: BuildPlan, kept: Manifest) -> Manifest | None:
     name, mended = plan.folder.name, kept
     if not _states(kept, plan.spec):
         tell(f"{name}: its provenance alone has changed: only {region_files.MANIFEST} is written")
-        mended = mended.model_copy(update={"provenance": plan.spec.origin, "attribution": plan.spec.origin.credit})
+        mended = mended.model_copy(update={"provenance": plan.spec.origin, "attribution": plan.spec.credit})
     if plan.with_preview and not _is_shown(kept):
         tell(f"{name}: its map is up to date, and {region_files.PREVIEW} is drawn")
         _write_preview(plan.folder, mended)
@@ -478,8 +485,8 @@ def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, gra
         fingerprint=fingerprint(reading.features),
         inputs_sha256=plan.inputs_sha256,
         files={},
-        licence=LICENCE,
-        attribution=spec.origin.credit,
+        licence=spec.licence,
+        attribution=spec.credit,
         provenance=spec.origin,
         # None where features are generated, and nothing is read
         own_maps=tuple(_own_map_record(one, path) for one, path in zip(spec.own_map, plan.own_maps, strict=False)),

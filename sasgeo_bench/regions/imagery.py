@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from sasgeo_bench.core.config import Document, JsonDocument, Line
 from sasgeo_bench.core.errors import ImageryError, StoreError
-from sasgeo_bench.core.folders import FileRecord, file_record, sha256_of
+from sasgeo_bench.core.folders import FileRecord, file_record
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, PlainName, Sha256, imagery_folders, named_files
@@ -269,10 +269,12 @@ Level = Annotated[int, Field(ge=0, le=255)]
 
 
 class ImageryEntry(Document):
-    """One `[[imagery]]` of a region file: a GeoTIFF of aerial pictures.
+    """One `[[imagery]]` of a region file: a GeoTIFF of aerial pictures, an MBTiles, a GeoPackage, a folder of tiles.
 
     `publish` says whether the picture, or what is cut out of it, may be passed on. `empty_rgb` is the colour of areas
     without a picture, in files that say so by no mask. `gsd_m` is a coarser ground resolution than the file has.
+    `layer` names one of several rasters of a GeoPackage; `tms` says that rows of a folder of tiles count from the
+    south.
 
     >>> from sasgeo_bench.core.config import parse_toml
     >>> text = '''
@@ -288,6 +290,8 @@ class ImageryEntry(Document):
     sasgeo_bench.core.errors.ConfigError: [[imagery]]: 'publish' is missing
     """
 
+    without_empty: ClassVar = frozenset({"layer", "tms"})
+
     file: PlainName
     sha256: Annotated[tuple[Sha256, ...], Field(strict=False, min_length=1)]
     date: dt.date
@@ -295,6 +299,8 @@ class ImageryEntry(Document):
     attribution: Line
     publish: bool
     source: Line | None = None
+    layer: Line | None = None
+    tms: bool = False
     empty_rgb: Annotated[tuple[Level, Level, Level], Field(strict=False)] | None = None
     gsd_m: Annotated[float, Field(gt=0, le=100)] | None = None
 
@@ -304,10 +310,12 @@ def find_imagery(entry: ImageryEntry, *, folders: Sequence[Path] = (), extracts:
 
     Pictures are never downloaded. Raise `ImageryError` if no folder holds it; the message says where to put it.
     """
+    from sasgeo_bench.regions.tiles import record_of  # noqa: PLC0415 - GDAL is slow to import
+
     places = imagery_folders(folders, extracts=extracts)
     wrong: list[str] = []
-    for path in named_files(entry.file, places):
-        found = sha256_of(path)
+    for path in named_files(entry.file, places, has_folders=True):
+        found = record_of(path).sha256
         if found in entry.sha256:
             return path
         wrong.append(f"{path} has SHA-256 {found}, which is none of those accepted")

@@ -572,6 +572,7 @@ def write_layers(
     paint: Callable[[int], PaintWindow],
     *,
     credit: str = ATTRIBUTION,
+    licence: str = LICENCE,
 ) -> None:
     """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
@@ -585,7 +586,7 @@ def write_layers(
     """
     factors = overview_factors(grid)
     try:
-        _lay_out(path, grid, classes, factors, credit=credit)
+        _lay_out(path, grid, classes, factors, {"attribution": credit, "licence": licence})
         with TiffFile(path, mode="r+") as file, ThreadPoolExecutor(1) as painting, ThreadPoolExecutor(1) as packing:
             levels = list(zip((1, *factors), (page.aspage() for page in file.pages), strict=True))[::-1]
             painters = _in_turn(painting, paint, (factor for factor, _ in levels))
@@ -599,7 +600,9 @@ def write_layers(
         ) from error
 
 
-def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence[int], *, credit: str) -> None:
+def _lay_out(
+    path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence[int], terms: Mapping[str, str]
+) -> None:
     """Write the headers of all levels, with names and licence; no block is stored yet."""
     is_big = len(classes) * grid.rows * grid.cols > 16 * _BIGTIFF_CELLS
     with rasterio.open(
@@ -622,7 +625,7 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence
         bigtiff="YES" if is_big else "NO",
     ) as target:
         target.descriptions = classes
-        target.update_tags(TIFFTAG_COPYRIGHT=credit, attribution=credit, licence=LICENCE)
+        target.update_tags(TIFFTAG_COPYRIGHT=terms["attribution"], **terms)
     with TiffFile(path) as file:
         about = [(tag, "s", 0, file.pages[0].aspage().tags[tag].value, True) for tag in (_COPYRIGHT, _GDAL_METADATA)]
     with TiffWriter(path, append=True) as levels:

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -21,12 +21,12 @@ from rasterio.vrt import WarpedVRT
 from rasterio.windows import Window
 
 from sasgeo_bench.core.errors import GridError, ImageryError
-from sasgeo_bench.core.folders import file_record
-from sasgeo_bench.core.geotiff import open_geotiff
+from sasgeo_bench.core.geotiff import is_database, open_geotiff
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.imagery import BANDS, ImageryEntry, PictureRecord
 from sasgeo_bench.regions.layers import RGB, Bands, find_bands, selected
+from sasgeo_bench.regions.tiles import open_tiled, open_tiles, record_of
 
 MOST_PIXELS: Final = 4_000_000_000  # of a picture
 MOST_ORTHO_PIXELS: Final = 2_000_000_000  # of what is cut out of all; what holds no picture counts too
@@ -50,7 +50,7 @@ class Picture:
 
     def record(self) -> PictureRecord:
         """Return what `region.json` says of the picture."""
-        entry, found = self.entry, file_record(self.path)
+        entry, found = self.entry, record_of(self.path)
         return PictureRecord(
             file=entry.file,
             sha256=found.sha256,
@@ -73,7 +73,7 @@ def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
         If it is no GeoTIFF, has no CRS, no 8-bit red, green and blue, too many pixels, or does not show the region.
     """
     try:
-        with _opened(path) as source:
+        with _opened(path, entry, grid) as source:
             _check_kind(path, source)
             to_grid = Transformer.from_crs(source.crs.to_wkt(), grid.epsg, always_xy=True)
             bounds_m = to_grid.transform_bounds(*_box(source), densify_pts=21, errcheck=True)
@@ -100,10 +100,10 @@ def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[rasterio.io.DatasetReader]:
-    """Open a GeoTIFF, and no other format; turn what GDAL says of it into one line."""
+def _opened(path: Path, entry: ImageryEntry, grid: Grid) -> Iterator[rasterio.io.DatasetReader]:
+    """Open a picture of a known kind, and of no other; turn what GDAL says of it into one line."""
     try:
-        with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES), open_geotiff(path, has_more=True) as source:
+        with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES), _source(path, entry, grid) as source:
             yield source
     except (RasterioError, OSError) as error:
         if isinstance(error, ImageryError | CRSError):
@@ -112,6 +112,17 @@ def _opened(path: Path) -> Iterator[rasterio.io.DatasetReader]:
             f"{path} cannot be read as a GeoTIFF ({str(error)[:200]}): it is damaged (get it again) or of another kind "
             "(make it one with gdal_translate)"
         ) from error
+
+
+def _source(path: Path, entry: ImageryEntry, grid: Grid) -> AbstractContextManager[rasterio.io.DatasetReader]:
+    """Return what opens a folder of tiles, an MBTiles or a GeoPackage, or else a GeoTIFF."""
+    if path.is_dir():
+        return open_tiles(path, grid, tms=entry.tms, gsd_m=entry.gsd_m)
+    if is_database(path):
+        return open_tiled(path, entry.layer)
+    if entry.layer is not None or entry.tms:
+        raise ImageryError(f"{path} is no GeoPackage of rasters or folder of tiles: leave layer and tms out")
+    return open_geotiff(path, has_more=True)
 
 
 def _check_kind(path: Path, source: rasterio.io.DatasetReader) -> None:
@@ -294,7 +305,7 @@ class _Warped:
 
     def __init__(self, picture: Picture, stack: ExitStack, grid: Grid) -> None:
         self._picture = picture
-        source = stack.enter_context(_opened(picture.path))
+        source = stack.enter_context(_opened(picture.path, picture.entry, grid))
         view = selected(source, picture.bands)
         if view is not None:
             source = stack.enter_context(rasterio.open(view, driver="VRT"))

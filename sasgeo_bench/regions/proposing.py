@@ -2,7 +2,6 @@
 """Region files for the extracts of a manifest: one to three windows for each place, where it is built."""
 
 import datetime as dt
-import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.osm.scan import scan_file
 from sasgeo_bench.osm.snapshot import open_snapshot
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.region_spec import Identifier, RegionFile
+from sasgeo_bench.regions.region_spec import Identifier, RegionFile, region_text
 from sasgeo_bench.regions.scenes import measure_ground
 
 STEP_M: Final = 128.0  # of the lattice on which windows lie
@@ -394,25 +393,16 @@ def _text(
     dated_by = _of_dates({item.date: item.date_known_by for item in listed})
     stated = zip(listed, extracts, strict=True)
     origin = _of_dates({item.date: item.source for item, extract in stated if not extract.urls})
-    lines = [
-        "# Extract (c) OpenStreetMap contributors, ODbL 1.0.",
-        f"id = {_quoted(name)}",
-        f"title = {_quoted(f'{titled}, {newest.country}: {newest.what}')}",
-        f"scenes = [{', '.join(map(_quoted, scenes))}]",
-        f"center_lonlat = [{', '.join(map(str, centre))}]",
-        f"size_m = [{', '.join(f'{side:.0f}' for side in size_m)}]",
-        "cell_size_m = 1.0",
-        "",
-        "[provenance]",
-        f"country = {_quoted(newest.country)}",
-        *([f"dated_by = {_quoted(dated_by)}"] if dated_by else []),
-        *([f"source = {_quoted(origin)}"] if origin else []),
-    ]
-    for extract in extracts:
-        hashes = "".join(f"  {_quoted(each)},\n" for each in extract.sha256)
-        lines += ["", "[[extract]]", f"file = {_quoted(extract.file)}", f"date = {extract.date.isoformat()}"]
-        lines += [f"sha256 = [\n{hashes}]", *([f"urls = [{_quoted(extract.urls[0])}]"] if extract.urls else [])]
-    return "\n".join(lines) + "\n"
+    fields = {
+        "id": name,
+        "title": f"{titled}, {newest.country}: {newest.what}",
+        "scenes": list(scenes),
+        "center_lonlat": list(centre),
+        "size_m": [round(side) for side in size_m],
+        "cell_size_m": 1.0,
+    }
+    provenance = {"country": newest.country, "dated_by": dated_by, "source": origin}
+    return region_text(fields, provenance=provenance, extracts=extracts)
 
 
 def _of_dates(texts: Mapping[dt.date, str | None]) -> str | None:
@@ -431,7 +421,3 @@ def _of_dates(texts: Mapping[dt.date, str | None]) -> str | None:
     while len("; ".join(lines)) > LONGEST_LINE:
         del lines[0]
     return "; ".join(lines) or None
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)

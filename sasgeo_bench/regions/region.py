@@ -4,6 +4,7 @@
 import datetime as dt
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Self, TypeVar, cast
 
 import numpy as np
@@ -22,6 +23,7 @@ from sasgeo_bench.regions.imagery import Imagery, OrthoRecord
 if TYPE_CHECKING:
     import geopandas as gpd
     import pandas as pd
+    from matplotlib.figure import Figure
 
 SCHEMA_VERSION: Final = 1  # of region.json and its tables
 DATA_VERSION: Final = 3  # of regions: raised whenever the same input gives another region
@@ -270,7 +272,7 @@ class Region:
         return self.manifest.classes
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows of a region; nothing more of it is read. `sgb.plot_region` draws it."""
+        """Return what a notebook shows of a region; nothing more of it is read. `plot` draws it."""
         about = self.manifest
         facts = {
             "map of": about.extract.date,
@@ -283,6 +285,11 @@ class Region:
             **about.provenance.titled(),
         }
         return html_facts(f"{about.title} ({about.id})", facts)
+
+    def plot(self) -> "Figure":
+        """Draw the region in one call; see `sgb.plot_region`."""
+        # By its public name: the drawing stands below in the order of files
+        return cast("Figure", import_module("sasgeo_bench").plot_region(self))
 
     def within(self, area: shapely.Geometry) -> "Region":
         """Return the region with no mapped ground beyond an area in its CRS; its layers stay what they are, unread."""

@@ -53,7 +53,14 @@ GROUP_ROWS: Final = 2**15  # of features or nodes that are read at once: a town 
 _MEND: Final = "build the region again"
 
 
-def write_tables(folder: Path, features: "gpd.GeoDataFrame", graph: MapGraph, *, credit: str = ATTRIBUTION) -> None:
+def write_tables(
+    folder: Path,
+    features: "gpd.GeoDataFrame",
+    graph: MapGraph,
+    *,
+    credit: str = ATTRIBUTION,
+    licence: str = LICENCE,
+) -> None:
     """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder.
 
     Features that fill several row groups are put in order along a Hilbert curve: a part of a map lies in few of them.
@@ -61,7 +68,7 @@ def write_tables(folder: Path, features: "gpd.GeoDataFrame", graph: MapGraph, *,
     if len(features) > GROUP_ROWS:
         features = features.iloc[np.argsort(features.hilbert_distance().to_numpy(), kind="stable")]
     geographic = {**CHECKED, "schema_version": "1.1.0", "row_group_size": GROUP_ROWS}
-    origin: Mapping[Any, Any] = {"attribution": credit, "licence": LICENCE}
+    origin: Mapping[Any, Any] = {"attribution": credit, "licence": licence}
     geometric = _attributed(features.reset_index(drop=True), origin)
     geometric.to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
     _attributed(graph.nodes, origin).to_parquet(folder / NODES, **geographic)

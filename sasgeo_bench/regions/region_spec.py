@@ -3,22 +3,30 @@
 
 import datetime as dt
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 import pyproj
 import shapely
 from pydantic import ConfigDict, Field, StringConstraints, field_validator, model_validator
 
-from sasgeo_bench.core.config import Document, Line, NamedDocument, find_document, list_documents, read_document
+from sasgeo_bench.core.config import (
+    Line,
+    NamedDocument,
+    find_document,
+    list_documents,
+    read_document,
+    toml_value,
+)
 from sasgeo_bench.core.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.osm.locate import Extract, PlainName, Sha256
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.osm.vector import ClassTable
 from sasgeo_bench.regions.imagery import ImageryEntry
-from sasgeo_bench.regions.region import Provenance
+from sasgeo_bench.regions.region import LICENCE, Provenance
 
 MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
 MAX_LONGITUDE_DEG: Final = 180.0
@@ -51,19 +59,19 @@ class StatedProvenance(Provenance):
     model_config = ConfigDict(extra="forbid")
 
 
-class OwnMap(Document):
-    """One `[[own_map]]` of a region file: GeoJSON of a source beside OpenStreetMap, and the classes that are from it.
+class OwnMap(ClassTable):
+    """One `[[own_map]]` of a region file: a file of another source than OpenStreetMap, and the classes that it gives.
 
-    Such classes are from no extract. Properties are tags, `tags` those that all features have; its mapped ground is
-    that of the region file. `date` is None where it is not known. `publish` says whether the map, and what is made of
-    it, may be passed on.
+    Such classes are from no extract: those that `class`, or `column` and `values`, name. A GeoJSON of tags of
+    OpenStreetMap has `classes` instead, and `tags` that all its features have. Its mapped ground is that of the region
+    file. `date` is None where it is not known. `publish` says whether the map, and what is made of it, may be passed
+    on.
 
     >>> from sasgeo_bench.core.config import parse_toml
     >>> text = '''
-    ... file = "houses.geojson"
+    ... file = "houses.gpkg"
     ... sha256 = ["0000000000000000000000000000000000000000000000000000000000000000"]
-    ... classes = ["building"]
-    ... tags = { building = "yes" }
+    ... class = "building"
     ... licence = "CC0-1.0"
     ... attribution = "the land survey"
     ... publish = true
@@ -72,10 +80,12 @@ class OwnMap(Document):
     'building: the land survey (CC0-1.0)'
     """
 
+    without_empty: ClassVar = frozenset(ClassTable.model_fields)
+
     file: PlainName
     sha256: Annotated[tuple[Sha256, ...], Field(strict=False, min_length=1)]
     date: dt.date | None = None
-    classes: Annotated[list[str], Field(min_length=1)]
+    classes: list[str] = []
     tags: dict[str, Line] = {}
     licence: Line
     attribution: Line
@@ -87,6 +97,28 @@ class OwnMap(Document):
     def _classes_are_known(cls, names: list[str]) -> list[str]:
         return _checked_classes(names)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _classes_of_table(cls, given: Any) -> Any:  # noqa: ANN401 - what a file holds
+        """State `classes` of a table, so that they stand where those of tags do."""
+        if not isinstance(given, dict) or "classes" in given:
+            return given
+        values = given.get("values")
+        named = {given.get("class"), *(values.values() if isinstance(values, dict) else ())}
+        return given | {"classes": [name for name in load_taxonomy().names if name in named]}
+
+    @model_validator(mode="after")
+    def _says_classes_once_or_tags(self) -> Self:
+        if self.named_classes and (self.tags or tuple(self.classes) != self.named_classes):
+            raise ValueError("classes and tags are of a GeoJSON of tags: leave them out beside class or column")
+        is_json = self.file.lower().endswith((".geojson", ".json"))
+        if not self.classes or not (self.named_classes or is_json):
+            raise ValueError(
+                f"say what the features of {self.file!r} are: class = '...', or column and values; a GeoJSON of tags "
+                "has classes instead"
+            )
+        return self
+
     @property
     def credit(self) -> str:
         """Return which classes are from it, whose it is, and its licence."""
@@ -95,7 +127,7 @@ class OwnMap(Document):
     def beside(self, extract: Extract) -> Extract:
         """Return it as an extract, to be found as such; of the day of the one beside it if it states none."""
         date = self.date or extract.date
-        return Extract(file=self.file, date=date, sha256=self.sha256, format="geojson", tags=self.tags)
+        return Extract(file=self.file, date=date, sha256=self.sha256, format="own_map")
 
 
 class RegionFile(NamedDocument):
@@ -138,6 +170,20 @@ class RegionFile(NamedDocument):
     own_map: list[OwnMap] = []
     imagery: list[ImageryEntry] = []
     provenance: StatedProvenance = StatedProvenance()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _own_map_alone(cls, given: Any) -> Any:  # noqa: ANN401 - what a file holds
+        """Let the first own map stand for the extract of a file that has none."""
+        own = given.get("own_map") if isinstance(given, dict) else None
+        if not isinstance(given, dict) or "extract" in given or not own or not isinstance(own, list):
+            return given
+        first = own[0] if isinstance(own[0], dict) else {}
+        if first.get("date") is None:
+            raise ValueError("without an [[extract]] the first [[own_map]] needs a date: add the day that it is of")
+        return given | {
+            "extract": [{key: first.get(key) for key in ("file", "date", "sha256")} | {"format": "own_map"}]
+        }
 
     @field_validator("cell_size_m")
     @classmethod
@@ -192,6 +238,10 @@ class RegionFile(NamedDocument):
     @model_validator(mode="after")
     def _has_one_source_of_a_class(self) -> Self:
         names = [name for one in self.own_map for name in one.classes]
+        if any(
+            item.format == "own_map" and item.file not in {one.file for one in self.own_map} for item in self.extract
+        ):
+            raise ValueError("format 'own_map' is of no [[extract]]: write [[own_map]] without one")
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise ValueError(f"[[own_map]] gives {twice!r} twice: a class is from one source")
@@ -203,8 +253,13 @@ class RegionFile(NamedDocument):
                 "[[own_map]] holds some classes in some places: say where they and the extract are complete by "
                 "coverage_lonlat or coverage_parts_lonlat, above [[extract]]; all else is unknown"
             )
-        if names and not self.extract_classes:
-            raise ValueError("[[own_map]] gives every class: leave one to [[extract]], or make the map an extract")
+        if names and bool(self.extract_classes) == self.is_own_alone:
+            known = ", ".join(self.extract_classes)
+            raise ValueError(
+                f"no [[own_map]] gives {known}: leave it out of `classes`, or add an [[extract]]"
+                if known
+                else "[[own_map]] gives every class: leave one to [[extract]], or leave [[extract]] out"
+            )
         return self
 
     @model_validator(mode="after")
@@ -249,14 +304,23 @@ class RegionFile(NamedDocument):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Return the classes of the map, in the order of their ids: those of `classes`, or all."""
-        return tuple(name for name in load_taxonomy().names if self.classes is None or name in self.classes)
+        """Return the classes of the map, in the order of their ids: those of `classes`, or all that it may have."""
+        known = self._own_classes if self.classes is None and self.is_own_alone else self.classes
+        return tuple(name for name in load_taxonomy().names if known is None or name in known)
+
+    @property
+    def is_own_alone(self) -> bool:
+        """Return whether nothing of it is from OpenStreetMap."""
+        return all(item.format == "own_map" for item in self.extract)
+
+    @property
+    def _own_classes(self) -> set[str]:
+        return {name for one in self.own_map for name in one.classes}
 
     @property
     def extract_classes(self) -> tuple[str, ...]:
         """Return the classes that are from the extract: all but those of `own_map`."""
-        own = {name for one in self.own_map for name in one.classes}
-        return tuple(name for name in self.class_names if name not in own)
+        return tuple(name for name in self.class_names if name not in self._own_classes)
 
     @property
     def origin(self) -> Provenance:
@@ -264,6 +328,16 @@ class RegionFile(NamedDocument):
         further = [*filter(None, [self.provenance.further_sources]), *(one.credit for one in self.own_map)]
         stated = {name: getattr(self.provenance, name) for name in self.provenance.model_fields_set}
         return Provenance(**stated | ({"further_sources": "; ".join(further)} if further else {}))
+
+    @property
+    def credit(self) -> str:
+        """Return whom to name beside what shows the map: OpenStreetMap, unless nothing is from there, and others."""
+        return self.origin.further_sources or "" if self.is_own_alone else self.origin.credit
+
+    @property
+    def licence(self) -> str:
+        """Return the licence of the map: ODbL, or those of its sources where nothing is from OpenStreetMap."""
+        return " AND ".join(dict.fromkeys(one.licence for one in self.own_map)) if self.is_own_alone else LICENCE
 
     def stated_coverage(self) -> shapely.Geometry | None:
         """Return the mapped area as stated, in longitude and latitude; None if it is to be estimated."""
@@ -381,3 +455,26 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
     """
     return find_document(id_or_path, "region", "list regions shows all", lambda: list_region_files(folders=folders))
+
+
+def region_text(
+    fields: Mapping[str, object], *, provenance: Mapping[str, str | None], extracts: Sequence[Extract]
+) -> str:
+    """Return the text of a region file: its keys in their order, lines of provenance that are known, and extracts.
+
+    >>> extract = Extract(file="mine.osm.pbf", date=dt.date(2024, 1, 1), sha256=("0" * 64,))
+    >>> text = region_text({"id": "mine", "size_m": [512, 512]}, provenance={"country": None}, extracts=[extract])
+    >>> text.splitlines()[1:5]
+    ['id = "mine"', 'size_m = [512, 512]', '', '[[extract]]']
+    """
+    stated = {name: text for name, text in provenance.items() if text}
+    lines = [
+        "# Extract (c) OpenStreetMap contributors, ODbL 1.0.",
+        *(f"{key} = {toml_value(fields[key])}" for key in fields),
+    ]
+    lines += ["", "[provenance]", *(f"{name} = {toml_value(text)}" for name, text in stated.items())] if stated else []
+    for extract in extracts:
+        hashes = "".join(f"  {toml_value(each)},\n" for each in extract.sha256)
+        lines += ["", "[[extract]]", f"file = {toml_value(extract.file)}", f"date = {extract.date.isoformat()}"]
+        lines += [f"sha256 = [\n{hashes}]", *([f"urls = [{toml_value(extract.urls[0])}]"] if extract.urls else [])]
+    return "\n".join(lines) + "\n"

@@ -16,7 +16,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.features import SEA
 from sasgeo_bench.osm.mapped import lonlat_box, project
-from sasgeo_bench.osm.read import read_extract
+from sasgeo_bench.osm.read import Reading, read_extract
 from sasgeo_bench.osm.scan import area_wkb, reaches
 from sasgeo_bench.osm.snapshot import elements, open_snapshot
 from sasgeo_bench.regions.region_spec import Scene
@@ -100,7 +100,11 @@ def measure_ground(path: Path, grid: Grid, *, at: dt.date | None = None) -> Grou
     Lines are as wide as they are drawn. Industry is `landuse=industrial`: large buildings are campuses and city blocks
     as often as works. Wood is a part of the class `green`.
     """
-    reading = read_extract(path, grid, at=at)
+    return ground_of(read_extract(path, grid, at=at), path, grid, at=at)
+
+
+def ground_of(reading: Reading, path: Path, grid: Grid, *, at: dt.date | None = None) -> Ground:
+    """Measure the mapped ground of a grid as `measure_ground`, of what was read of an extract before."""
     return share_ground(reading.features, reading.coverage, land=_read_land(path, grid, at=at))
 
 

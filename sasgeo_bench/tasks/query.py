@@ -4,8 +4,9 @@
 import datetime as dt
 import math
 from dataclasses import dataclass, field
+from importlib import import_module
 from itertools import product
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import TYPE_CHECKING, Final, Literal, Self, cast
 
 import numpy as np
 import shapely
@@ -18,6 +19,9 @@ from sasgeo_bench.tasks.frames import Frame, FrameLabels
 
 if TYPE_CHECKING:
     import geopandas as gpd
+    from matplotlib.figure import Figure
+
+    from sasgeo_bench.regions.region import Region
 
 TWIN_EAST, TWIN_NORTH = "twin_east_m", "twin_north_m"  # measured: offset from a site to its copy
 TWIN_TURN: Final = "twin_turn_deg"  # measured: clockwise, from a heading to that at which the twin looks like it
@@ -246,7 +250,7 @@ class Query(_Question):
     step: Step | None = None
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows of a query; `sgb.plot_query` draws it."""
+        """Return what a notebook shows of a query; `plot` draws it."""
         view, (rows, cols) = self.evidence, self.evidence.shape
         seen = [name for name, cells in zip(view.classes, view.cells, strict=True) if (cells == PRESENT).any()]
         facts = {
@@ -259,6 +263,11 @@ class Query(_Question):
             "candidates": len(self.candidates),
         }
         return html_facts(f"query {self.query_id}", facts)
+
+    def plot(self, region: "Region", truth: "Truth | None" = None) -> "Figure":
+        """Draw the query on its map in one call, with the true place if its truth is given; see `sgb.plot_query`."""
+        # By its public name: the drawing stands below in the order of folders
+        return cast("Figure", import_module("sasgeo_bench").plot_query(self, region, truth))
 
     def __post_init__(self) -> None:
         if self.vectors is None or not len(self.vectors):

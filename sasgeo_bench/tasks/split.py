@@ -80,7 +80,7 @@ class SplitFile(NamedDocument):
     buffer_m: Annotated[float, Field(ge=0, le=1e6)]
     block_m: Annotated[float, Field(ge=100, le=20_000)] = 1000.0
     reach_m: Annotated[float, Field(ge=0, le=5000)] = 360.0
-    place: Annotated[list[Place], Field(min_length=2)]
+    place: Annotated[list[Place], Field(min_length=1)]
     lends: list[str] = []
 
     @model_validator(mode="after")

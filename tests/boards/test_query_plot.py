@@ -4,8 +4,10 @@
 from dataclasses import replace
 from io import BytesIO
 
+import numpy as np
 import pytest
 from matplotlib import image
+from matplotlib.colors import to_rgb
 from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 
@@ -61,6 +63,40 @@ def test_a_notebook_shows_a_figure_without_pyplot(tiny):
     figure = sgb.plot_region(tiny.region)
     assert image.imread(BytesIO(figure._repr_png_()), format="png").shape[2] == 4
     assert sgb.plot_query(tiny.queries[0], tiny.region)._repr_png_().startswith(b"\x89PNG")
+
+
+def test_each_is_drawn_in_one_call(tiny):
+    query, truth = first_of(tiny, "localization")
+    assert titles(query.plot(tiny.region)) == titles(sgb.plot_query(query, tiny.region))
+    assert titles(query.plot(tiny.region, truth)) == titles(sgb.plot_query(query, tiny.region, truth))
+    drawn, expected = tiny.region.plot(), sgb.plot_region(tiny.region)
+    assert [text.get_text() for text in drawn.texts] == [text.get_text() for text in expected.texts]
+    assert (drawn.axes[0].images[0].get_array() == expected.axes[0].images[0].get_array()).all()
+
+
+def test_evidence_is_drawn_in_the_colours_of_its_classes_with_its_confidence_beside_it():
+    chance = np.full((2, 10, 20), 0.1)
+    chance[0, :5], chance[1, :, :4] = 0.9, 0.6
+    chance[:, 9] = np.nan
+    seen = sgb.Evidence.of_probabilities(("building", "water"), chance, cell_size_m=2.0)
+    figure = sgb.plot_evidence(seen, title="seen", data="a drone")
+    view, confidence = figure.axes
+    colours = view.images[0].get_array()
+    taxonomy = sgb.load_taxonomy()
+    assert tuple(colours[0, 10]) == pytest.approx(to_rgb(taxonomy["building"].colour))
+    assert tuple(colours[7, 0]) == pytest.approx(to_rgb(taxonomy["water"].colour))
+    shown = confidence.images[0].get_array()
+    assert shown.mask[9].all()
+    assert not shown.mask[:9].any()
+    assert shown[0, 10] == pytest.approx((0.8 + 0.8) / 2, abs=0.01)
+    assert shown[7, 0] == pytest.approx((0.8 + 0.2) / 2, abs=0.01)
+    assert view.images[0].get_extent() == [0, 40, 0, 20]
+    texts = {text.get_text() for legend in figure.findobj(Legend) for text in legend.get_texts()}
+    assert texts == {"building", "water", "none of these classes", "unknown"}
+    certain = sgb.Evidence(classes=("water",), cells=np.zeros((1, 4, 4), dtype=np.uint8), cell_size_m=1.0)
+    assert len(sgb.plot_evidence(certain).axes) == 1
+    with pytest.raises(ConfigError, match="expected a Evidence"):
+        sgb.plot_evidence(chance)
 
 
 def test_texts_of_a_region_and_a_query_are_escaped_for_a_notebook(tiny):

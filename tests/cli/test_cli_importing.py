@@ -85,6 +85,7 @@ def test_locate_says_where_a_set_lies_and_what_covers_it(program, tmp_path):
     assert "[9.5220, 47.1500]" in lines[1]
     assert "1.0 x 1.0" in lines[1]
     assert " vaduz " in lines[1]
+    assert lines[1].split(" - ")[1].strip().startswith("europe/liechtenstein, ")
     assert lines[3].endswith("asia/china/zhejiang, asia/china, asia")
     assert not (tmp_path / "out").exists()
 

@@ -17,6 +17,7 @@ from shapely import affinity
 from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.regions.region_spec import RegionFile
+from sasgeo_bench.regions.tiles import record_of
 
 EPSG = 32632
 WEST, SOUTH = 500_000.0, 5_210_000.0
@@ -70,7 +71,7 @@ class Hamlet:
             extract=sha256_of(self.folder / "houses.geojson"),
             picture=self.picture,
             publish=str(self.publish).lower(),
-            sha256=sha256_of(self.folder / self.picture),
+            sha256=record_of(self.folder / self.picture).sha256,
         )
         return text + self.extra
 

@@ -211,7 +211,7 @@ def test_what_belongs_to_a_raster_may_lie_beside_it(tmp_path):
 
 
 def test_every_reader_of_rasters_and_pictures_names_the_formats_that_it_takes():
-    """Rasters by `open_geotiff` alone."""
+    """Rasters by `open_geotiff` and `open_database` alone."""
     root = Path(sasgeo_bench.__file__).parent
     loose = []
     for path in root.rglob("*.py"):

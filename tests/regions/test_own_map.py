@@ -3,6 +3,7 @@
 
 from pathlib import Path
 
+import geopandas as gpd
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -10,13 +11,14 @@ import rasterio
 import rasterio.features
 import shapely
 from affine import Affine
+from numpy.typing import NDArray
 
 from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError, ExtractError, ImageryError, StoreError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.regions.build import build_region, plan_build
-from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.regions.region import ATTRIBUTION, Region
 from sasgeo_bench.regions.region_files import check_publishable, read_manifest, read_region
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
 from tests.regions.imagery_place import write_houses
@@ -155,11 +157,122 @@ def test_a_map_that_must_not_be_passed_on_is_refused(folder, tmp_path):
         (['["building"]'], {"has_ring": False}, "say where they and the extract are complete by coverage_lonlat"),
         (['["building"]'], {"classes": '["building"]'}, "gives every class: leave one to"),
         (['["bulding"]'], {}, "classes has 'bulding', which is no class"),
+        (["[]"], {}, "say what the features of 'survey.geojson' are: class"),
     ],
 )
 def test_what_it_cannot_be_is_refused_in_a_line(own, changes, fault, folder):
     with pytest.raises(ConfigError) as found:
         spec_of(*(own_of(folder, classes=classes) for classes in own), **changes)
+    assert fault in str(found.value)
+    assert "\n" not in str(found.value)
+
+
+TABLE = """
+[[own_map]]
+file = "survey.gpkg"
+sha256 = ["{sha256}"]
+date = 2023-05-06
+layer = "ground"
+column = "use"
+licence = "CC-BY-4.0"
+attribution = "a land survey"
+publish = true
+[own_map.values]
+house = "building"
+pond = "water"
+"""
+OWN_EXTRACT = f'[[extract]]\nfile = "a"\ndate = 2024-01-01\nformat = "own_map"\nsha256 = ["{"0" * 64}"]\n'
+POND = shapely.box(WEST + 200, SOUTH + 205, WEST + 240, SOUTH + 235)
+
+
+def survey_of(folder: Path) -> str:
+    """A GeoPackage of two classes in another CRS, and the lines that name it."""
+    uses = ["house"] * len(HOUSES) + ["pond", "vineyard"]
+    shapes = [*HOUSES, POND, shapely.box(WEST + 400, SOUTH + 400, WEST + 410, SOUTH + 410)]
+    ground = gpd.GeoDataFrame({"use": uses}, geometry=shapes, crs=EPSG)
+    ground.to_crs(3035).to_file(folder / "survey.gpkg", layer="ground")
+    return TABLE.format(sha256=sha256_of(folder / "survey.gpkg"))
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A region of nothing but a land survey."""
+    folder = tmp_path_factory.mktemp("alone")
+    text = text_of(survey_of(folder), classes="[]").replace("classes = []\n", "")
+    begin, end = text.index("[[extract]]"), text.index("[[own_map]]")
+    spec = parse_toml(text[:begin] + text[end:], RegionFile, source="mine.toml")
+    plan = plan_build(spec, out=folder / "out", extract_folders=[folder])
+    build_region(plan)
+    assert plan_build(spec, out=folder / "out", extract_folders=[folder]).is_current
+    return plan.folder
+
+
+def burnt(region: Region, shapes: list[shapely.Geometry]) -> NDArray[np.uint8]:
+    """Cells whose middle a shape holds, and 255 where nothing is mapped."""
+    transform = Affine(*region.grid.transform)
+    inside = [part for shape in shapes if not (part := shapely.intersection(shape, INNER)).is_empty]
+    found = rasterio.features.rasterize(inside, out_shape=region.grid.shape, transform=transform)
+    known = rasterio.features.geometry_mask([INNER], out_shape=region.grid.shape, transform=transform, invert=True)
+    return np.where(known, found, 255).astype(np.uint8)
+
+
+def test_a_table_of_classes_fills_them_from_one_layer_and_all_others_are_of_the_extract(tmp_path):
+    spec = spec_of(survey_of(tmp_path), classes='["road_major", "road_minor", "building", "water"]')
+    assert spec.extract_classes == ("road_major", "road_minor")
+    manifest = build_region(plan_build(spec, out=tmp_path / "out", extract_folders=[tmp_path]))
+    region = read_region(tmp_path / "out" / "regions" / "mine")
+    for name, shapes in (("building", HOUSES), ("water", [POND])):
+        different = region.layer(name) != burnt(region, shapes)
+        assert different.sum() < 10, name  # corners of the mapped area are rounded to a millimetre
+    assert (region.layer("road_minor") == 1).any()
+    assert manifest.drops["use=vineyard: not in `values`"] == 1
+    assert any("1 of 66 features in the region have no class" in warning for warning in manifest.warnings)
+    assert manifest.own_maps[0].classes == ("building", "water")
+    assert manifest.attribution == f"{ATTRIBUTION}; building, water: a land survey (CC-BY-4.0)"
+
+
+def test_alone_it_is_the_map_with_its_own_date_licence_and_credit(alone):
+    region, manifest = read_region(alone), read_manifest(alone)
+    assert region.classes == ("building", "water")
+    assert manifest.extract.date.isoformat() == "2023-05-06"
+    assert (manifest.licence, manifest.attribution) == ("CC-BY-4.0", "building, water: a land survey (CC-BY-4.0)")
+    assert manifest.counts == {"building": len(HOUSES), "water": 1}
+    for name, shapes in (("building", HOUSES), ("water", [POND])):
+        assert (region.layer(name) != burnt(region, shapes)).sum() < 10, name
+    with rasterio.open(alone / "layers.tif") as layers:
+        assert layers.tags()["licence"] == "CC-BY-4.0"
+    for name in ("features", "nodes", "edges"):
+        text = str(pq.read_schema(alone / f"{name}.parquet").metadata)
+        assert "CC-BY-4.0" in text, name
+        assert "OpenStreetMap" not in text, name
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ("date = 2023-05-06\n", "", "without an [[extract]] the first [[own_map]] needs a date"),
+        (
+            'id = "mine"',
+            'id = "mine"\nclasses = ["road_minor", "building", "water"]',
+            "no [[own_map]] gives road_minor",
+        ),
+        ("column", 'class = "water"\ncolumn', "say which class its features are by class"),
+        ("column", 'tags = { building = "yes" }\ncolumn', "classes and tags are of a GeoJSON of tags"),
+        ('column = "use"\n', "", "say which class its features are by class"),
+        (
+            "[[own_map]]",
+            '[[extract]]\nfile = "a"\ndate = 2024-01-01\n[[own_map]]',
+            "needs either sha256 = [...] or town",
+        ),
+        ("[[own_map]]", f"{OWN_EXTRACT}[[own_map]]", "format 'own_map' is of no [[extract]]"),
+    ],
+)
+def test_a_region_of_it_alone_that_cannot_be_is_refused_in_a_line(old, new, fault, tmp_path):
+    text = text_of(survey_of(tmp_path), classes="[]").replace("classes = []\n", "")
+    text = text[: text.index("[[extract]]")] + text[text.index("[[own_map]]") :]
+    assert old in text
+    with pytest.raises(ConfigError) as found:
+        parse_toml(text.replace(old, new, 1), RegionFile, source="mine.toml")
     assert fault in str(found.value)
     assert "\n" not in str(found.value)
 

@@ -8,23 +8,20 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import numpy as np
 import shapely
-from pydantic import Field
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from sklearn.cluster import DBSCAN  # type: ignore[import-untyped, unused-ignore]
 
-from sasgeo_bench.core.config import Document, Line, parse_toml
 from sasgeo_bench.core.errors import DatasetError, counted
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.exchange.importers.items import MOST_ITEMS, Box, Dataset, Item, Position, Role
 from sasgeo_bench.geometry.projection import to_lonlat
+from sasgeo_bench.osm.regional import regional_extracts_of
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
 
 IMAGES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -233,25 +230,6 @@ GAP_M: Final = 5_000.0  # items farther apart than this lie in different areas
 _RADIUS_M: Final = 6_371_000.0
 _M_PER_DEG: Final = 111_320.0
 _STEP_DEG: Final = 0.001  # items within such a cell count once when areas are formed
-_FILE: Final = "regional_extracts.toml"
-
-
-class RegionalExtract(Document):
-    """A regional extract of download.geofabrik.de, by its name there; the box is rounded outwards."""
-
-    name: Line
-    box: Annotated[tuple[float, float, float, float], Field(strict=False)]
-
-
-class _RegionalExtracts(Document):
-    extract: list[RegionalExtract]
-
-
-@cache
-def regional_extracts() -> tuple[RegionalExtract, ...]:
-    """Return the regional extracts that are known here: provinces of China, and the continents."""
-    text = resources.files("sasgeo_bench.exchange.importers").joinpath(_FILE).read_text(encoding="utf-8")
-    return tuple(parse_toml(text, _RegionalExtracts, source=_FILE).extract)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -303,7 +281,6 @@ def _extent(members: Sequence[Item], grounds: dict[str, shapely.Geometry]) -> Ex
     area = shapely.box(box.west_deg, box.south_deg, box.east_deg, box.north_deg)
     covering = [name for name, ground in grounds.items() if ground.covers(area)]
     touching = [name for name, ground in grounds.items() if name not in covering and ground.intersects(area)]
-    holding = [item for item in regional_extracts() if shapely.box(*item.box).covers(area)]
     per_lon_m = _M_PER_DEG * math.cos(math.radians(box.centre.latitude_deg))
     return Extent(
         box=box,
@@ -313,7 +290,7 @@ def _extent(members: Sequence[Item], grounds: dict[str, shapely.Geometry]) -> Ex
         height_km=(box.north_deg - box.south_deg) * _M_PER_DEG / 1000,
         covered_by=tuple(covering),
         touched_by=tuple(touching),
-        extracts=tuple(item.name for item in sorted(holding, key=lambda item: shapely.box(*item.box).area)),
+        extracts=tuple(item.name for item in regional_extracts_of(area)),
     )
 
 

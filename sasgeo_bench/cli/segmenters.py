@@ -58,14 +58,12 @@ def segment(options: SegmentOptions) -> tuple[Path, ...]:
     StoreError
         If a task or its truths are missing or damaged.
     """
+    split = options.split or Task.open(options.tasks[0]).manifest.split  # none of pictures of one's own
     return segment_tasks(
         SegmentTasks(
             spec=options.segmenter,
             tasks=options.tasks,
-            split=find_split(
-                options.split or str(Task.open(options.tasks[0]).manifest.split),
-                folders=tuple(options.region_files or ()),
-            ),
+            split=None if split is None else find_split(split, folders=tuple(options.region_files or ())),
             out=options.out,
             is_recalibrated=options.recalibrated,
             most=options.most_trained,

@@ -40,14 +40,14 @@ class SegmentTasks:
 
     `tasks` are folders of `out/tasks`. A segmenter that learns does so from `tasks` and `taught` of the other half of a
     cross-fit, or of the train places of a hold-out, never of a sealed place: at most `most` pictures of the ordinary
-    look, evenly over places, suites and sites. `limits.match_s` is for one picture. With `is_recalibrated`, the
-    probabilities of all pictures of a task are shifted together, so that the mean of each class is its share of the map
-    within the priors. `jobs` counts the tasks at once.
+    look, evenly over places, suites and sites; without a split, as of pictures of one's own, from none.
+    `limits.match_s` is for one picture. With `is_recalibrated`, the probabilities of all pictures of a task are shifted
+    together, so that the mean of each class is its share of the map within the priors. `jobs` counts the tasks at once.
     """
 
     spec: str
     tasks: Sequence[Path]
-    split: Split
+    split: Split | None
     out: Path
     taught: Sequence[Path] = ()
     is_recalibrated: bool = False
@@ -168,6 +168,8 @@ def _pictured(folder: Path) -> Task:
 def _groups(wanted: SegmentTasks) -> list[_Group]:
     split = wanted.split
     tasks = {folder: _pictured(folder) for folder in dict.fromkeys((*wanted.tasks, *wanted.taught))}
+    if split is None:
+        return [_Group(name="no split", asked=tuple(tasks[folder] for folder in dict.fromkeys(wanted.tasks)), train=())]
     region = {folder: base_of(task.manifest.region) for folder, task in tasks.items()}
     group = {folder: _group_of(region[folder], split) for folder in tasks}
     strange = next((task for task, name in group.items() if name is None), None)
@@ -197,12 +199,17 @@ def _group_of(region: str, split: Split) -> str | None:
 def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group) -> str | None:
     """Return what a segmenter learned for a group, out of its file or by training; None with nothing to learn from."""
     if not group.train:
-        if "training" in loaded.card.needs:
+        if "training" in loaded.card.needs and wanted.split is None:
+            raise ConfigError(
+                f"{loaded.card.name} needs training, and these tasks have no split: name one with --split"
+            )
+        if "training" in loaded.card.needs and wanted.split is not None:
             raise ConfigError(
                 f"{loaded.card.name} needs training, and all tasks are of one half or part of split "
                 f"{wanted.split.spec.id!r}: name tasks of the other one, too"
             )
         return None
+    assert wanted.split is not None  # noqa: S101 - without one there is nothing to learn from
     chosen = plan_training(
         [task.folder for task in group.train],
         asked=[task.folder for task in group.asked],

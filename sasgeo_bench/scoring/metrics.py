@@ -35,7 +35,7 @@ from sasgeo_bench.scoring.metric import (
     ThresholdMetric,
 )
 from sasgeo_bench.scoring.pose import PoseErrors, Ranks, area_values, hits, reciprocal_ranks, successes
-from sasgeo_bench.tasks.query import SEQUENCE
+from sasgeo_bench.tasks.query import SEQUENCE, TRUTH_SIGMA
 
 _INF: Final = float("inf")
 
@@ -226,6 +226,12 @@ def _successes(scores: pd.DataFrame, within_m: float, within_deg: float = 5.0) -
     return successes(errors_of(scores), within_m, within_deg).astype(float)
 
 
+def _is_sharp(scores: pd.DataFrame, within_m: float) -> Bools:
+    """Return a mask of the present places whose truth is known to half a tolerance or better."""
+    is_fuzzy = scores["strength_unit"].eq(TRUTH_SIGMA) & (2 * scores["strength"] > within_m)  # two sigmas: 95 %
+    return is_present(scores) & ~is_fuzzy.to_numpy(bool)
+
+
 def _hits(scores: pd.DataFrame, k: int) -> Floats:
     return hits(ranks_of(scores), k)
 
@@ -280,6 +286,7 @@ _MEANS: Final = (
             source="share of all queries within metres and 5 deg",
             tracks=(LOCALIZATION,),
             values=partial(_successes, within_m=within_m),
+            counts=partial(_is_sharp, within_m=within_m),
             is_primary=within_m == SUCCESS_M[0],
         )
         for within_m in SUCCESS_M

@@ -28,6 +28,7 @@ TWIN_TURN: Final = "twin_turn_deg"  # measured: clockwise, from a heading to tha
 CEILING: Final = "ceiling"  # measured: the most that a matcher can expect, where copies leave nothing to tell them by
 UNRIVALLED: Final = "unrivalled"  # begins the kind of a stress whose rival is out of reach: it decides nothing
 COPIES: Final = "twins"  # measured: exact copies of the place among the candidates
+TRUTH_SIGMA: Final = "m, standard deviation of the truth"  # unit of the strength of truths that are not exact
 TASK_VERSION: Final = 5  # of queries.parquet and truth.parquet: raised when the same request gives other queries
 TASK_VERSIONS: Final = (1, 2, 3, 4, TASK_VERSION)  # readable versions: their files are alike
 

@@ -9,6 +9,7 @@ import pytest
 from sasgeo_bench.scoring.decisions import Fixes, augrc, aurc, excess_aurc
 from sasgeo_bench.scoring.metric import MeanMetric
 from sasgeo_bench.scoring.metrics import METRICS, REJECTION, means_of, primary_of, quantiles_of
+from sasgeo_bench.tasks.query import TRUTH_SIGMA
 from tests.scoring.test_tables import scores
 
 SOME = Fixes(confidence=[0.9, 0.8, 0.1, 0.0], is_answered=[1] * 4, is_right=[1, 0, 1, 1], is_present=[1] * 4)
@@ -36,6 +37,17 @@ def test_means_compute_what_they_are_named_after():
     assert found["within_25m"] == 0.75
     assert found["success_auc_50m"] == pytest.approx((0.98 + 0.86 + 0.6) / 4)
     assert all(isinstance(metric, MeanMetric) for metric in means_of("retrieval"))
+
+
+def test_success_is_not_scored_within_less_than_two_deviations_of_the_truth():
+    table = scores([1.0, 7.0, 20.0]).assign(strength=[2.0, 5.0, 2.0], strength_unit=["views", TRUTH_SIGMA, TRUTH_SIGMA])
+    counts = {metric.name: metric.counts(table).tolist() for metric in means_of("localization")}
+    assert counts["success_25m"] == counts["success_10m"] == [True, True, True]  # 10 m are two of 5 m
+    assert counts["success_5m"] == [True, False, True]
+    table = table.assign(strength=[2.0, 20.0, 5.1])
+    counts = {metric.name: metric.counts(table).tolist() for metric in means_of("localization")}
+    assert (counts["success_25m"], counts["success_10m"]) == ([True, False, True], [True, False, False])
+    assert counts["answered"] == [True, True, True]
 
 
 def test_quantiles_name_their_share():

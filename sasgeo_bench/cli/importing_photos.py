@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands that make tasks of a user's own pictures: import-photos."""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import typer
+
+from sasgeo_bench.cli.console import say, shown_progress
+from sasgeo_bench.cli.options import Options, Out, takes
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.observing.import_photos import GROUP, SUITE, ImportRequest
+from sasgeo_bench.observing.import_photos import import_photos as imported_by
+from sasgeo_bench.observing.picture_poses import PoseFacts
+from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights
+from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.task_files import Task
+
+_NUMBER: Final = r"[+-]?[0-9]+(?:\.[0-9]+)?"
+_ORIGIN: Final = re.compile(rf"\s*({_NUMBER})\s*,\s*({_NUMBER})\s*(?:,\s*({_NUMBER})\s*)?")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportPhotosOptions(Options):
+    """Flags of import-photos."""
+
+    pictures: Annotated[Path, typer.Argument(help="folder of photos (JPEG, TIFF, DNG, PNG, WebP, GeoTIFF)")] = field(
+        kw_only=False
+    )
+    region: Annotated[str, typer.Option(help="built region, or its folder")]
+    name: Annotated[str, typer.Option(help="suite of the task")] = SUITE
+    poses: Annotated[Path | None, typer.Option(help="table of poses; default: EXIF and XMP of the photos")] = None
+    epsg: Annotated[int | None, typer.Option(help="of a table's eastings and northings")] = None
+    origin: Annotated[str | None, typer.Option(help="LON,LAT[,HEIGHT] of a table's metres east, north, up")] = None
+    pitch_zero: Annotated[
+        Literal["down", "horizon"] | None, typer.Option(help="where a table's plain pitch counts from")
+    ] = None
+    height: Annotated[float | None, typer.Option(help="of the cameras above the ground, metres")] = None
+    dem: Annotated[Path | None, typer.Option(help="heights of the ground above the sea, a GeoTIFF")] = None
+    takeoff_height: Annotated[float | None, typer.Option(help="altitude of the place of take-off, metres")] = None
+    sigma: Annotated[
+        float | None,
+        typer.Option(help=f"standard deviation of positions that state none, metres; default: GPS, {GPS_SIGMA_M:g}"),
+    ] = None
+    prior: Annotated[str, typer.Option(help="prior group, as in r500-weak-s10")] = GROUP.name
+    seed: Annotated[int, typer.Option(help="of priors and odometry")] = 0
+    out: Out = Path("out")
+
+
+@takes(ImportPhotosOptions)
+def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
+    """Make tasks of pictures of your own, whose places are known: single views, and flights.
+
+    `segment` makes evidence of them, then `run` and `score` work as on any task. Positions come from the photos or a
+    table (exiftool, CSV, GeoJSON, TUM, COLMAP, OpenDroneMap, Pix4D, Metashape); they are truths, and how far each is
+    off is stored with it.
+
+    Returns
+    -------
+    tuple of Task
+        The task of single views, and that of flights where pictures follow each other.
+
+    Raises
+    ------
+    ConfigError
+        If an option makes no sense, or no picture can be asked.
+    ImageError
+        If there is no picture.
+    PoseError
+        If the table cannot be read.
+    StoreError
+        If the region is missing or damaged.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> sgb.import_photos("photos", region="vaduz", height=80.0, takeoff_height=460.0)
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.core.errors.ConfigError: heights come from one source: give --height, --dem or --takeoff-height alone
+    """
+    heights = Heights(height_m=options.height, dem=options.dem, takeoff_m=options.takeoff_height)
+    folder = Path(options.region)
+    request = ImportRequest(
+        pictures=options.pictures,
+        region=folder if (folder / "region.json").is_file() else options.out / "regions" / options.region,
+        out=options.out,
+        name=options.name,
+        poses=options.poses,
+        facts=PoseFacts(epsg=options.epsg, origin=_origin(options.origin), pitch_zero=options.pitch_zero),
+        heights=heights,
+        sigma_m=options.sigma,
+        group=PriorGroup.parse(options.prior),
+        seed=options.seed,
+    )
+    tasks = imported_by(request)
+    for task in tasks:
+        options.say(task.folder)
+    return tasks
+
+
+def import_photos_command(options: ImportPhotosOptions) -> None:
+    """Make tasks of pictures of your own, whose places are known: single views, and flights."""
+    lines: list[object] = []  # printed once the progress bars are gone
+    with shown_progress():
+        import_photos(**vars(options) | {"say": lines.append})
+    for line in lines:
+        say(line)
+
+
+def _origin(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    found = _ORIGIN.fullmatch(text)
+    if found is None:
+        raise ConfigError(f"--origin is LON,LAT or LON,LAT,HEIGHT in degrees and metres, got {text!r}")
+    return float(found[1]), float(found[2]), float(found[3] or 0.0)

@@ -1,0 +1,430 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a user's own as tasks: single views, and flights of those that were taken one after the other."""
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+import cv2
+import numpy as np
+
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, counted, named
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import NAME, plain
+from sasgeo_bench.flights.drift_profile import load_profile
+from sasgeo_bench.flights.odometry import Odometry, draw_odometry
+from sasgeo_bench.flights.trajectory import Trajectory
+from sasgeo_bench.geometry.pose import Prior
+from sasgeo_bench.observing.picture_poses import PoseFacts
+from sasgeo_bench.observing.pictures import list_pictures, names_of, see
+from sasgeo_bench.observing.pose_tables import read_pose_table
+from sasgeo_bench.observing.posed_pictures import Heights, PosedPicture, PosedPictures, lenses_of, pose_pictures
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.regions.region_files import read_manifest
+from sasgeo_bench.sensing.image import AerialImage
+from sasgeo_bench.tasks.build import put_task
+from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
+from sasgeo_bench.tasks.private_seed import seed_record
+from sasgeo_bench.tasks.query import (
+    REAL,
+    SEQUENCE_DIGITS,
+    TRUTH_SIGMA,
+    PriorGroup,
+    Query,
+    Step,
+    Truth,
+    view_id,
+)
+from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, make_prior
+from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.suites.base import Seeds
+from sasgeo_bench.tasks.suites.pictures import unseen
+from sasgeo_bench.tasks.task_files import Task, TaskOrigin, TruthManifest
+
+SUITE: Final = "photos"
+FLIGHTS: Final = "-flights"  # after the name of a suite: the same pictures as flights
+GROUP: Final = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.10)
+GAP_S: Final = 30.0  # between two pictures, which ends a flight
+LEAST_FRAMES: Final = 3
+DRIFT: Final = "vio-mono"  # measured profile of the odometer
+_VERSION: Final = 1
+_MOST_PX: Final = 768  # of a side of a picture in a task, as in the suites
+_BLOCK_M: Final = 1000.0
+_FASTEST_MPS: Final = 40.0  # of a drone between two pictures
+_SHOWN: Final = 3
+_CELLS: Final = 16  # of which the side of a view is a multiple, so that a board has few kinds of views
+_STEPS_M: Final = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # of standard deviations, which are rounded up for scoring
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportRequest:
+    """Pictures that become tasks of a region.
+
+    Parameters
+    ----------
+    pictures : Path
+        Folder of photos (JPEG, TIFF, DNG), georeferenced pictures, or PNG and WebP with a table that tells their poses.
+    region : Path
+        Folder of a built region.
+    out : Path
+        Root of tasks and truths.
+    name : str
+        Suite of the task; that of flights ends in "-flights".
+    poses : Path, optional
+        Table that replaces what photos say of themselves (`pose_tables.read_pose_table`).
+    facts : PoseFacts
+        What the table leaves open.
+    heights : Heights
+        Where heights above the ground come from, in place of those that photos state above take-off.
+    sigma_m : float, optional
+        Standard deviation of places, of pictures whose file or row does not state it; by default that of GPS.
+    group : PriorGroup
+        How much is known before.
+    seed : int
+        Of priors and of the odometer's errors.
+
+    Raises
+    ------
+    ConfigError
+        If the name is none, or that of a suite that ships.
+    """
+
+    pictures: Path
+    region: Path
+    out: Path
+    name: str = SUITE
+    poses: Path | None = None
+    facts: PoseFacts = field(default_factory=PoseFacts)
+    heights: Heights = field(default_factory=Heights)
+    sigma_m: float | None = None
+    group: PriorGroup = GROUP
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(NAME, self.name) or self.name in EVERY_SUITE:
+            raise ConfigError(
+                f"--name {self.name!r} is no name for a suite of your own: take small letters, digits, - and _, and "
+                "none of `list suites`"
+            )
+        if self.sigma_m is not None and not 0 < self.sigma_m <= 100:
+            raise ConfigError(f"--sigma lies above 0 and within 100 m, got {self.sigma_m!r}")
+        if self.seed < 0:
+            raise ConfigError(f"--seed is 0 or more, got {self.seed!r}")
+
+
+def import_photos(request: ImportRequest) -> tuple[Task, ...]:
+    """Write the tasks of some pictures: single views, and flights where pictures follow each other.
+
+    The truth is the middle of the ground that a picture shows, a square as `locate` sees it. It is as good as the
+    position in the file or table: its standard deviation is stored with it (`measured["truth_sigma_m"]`). Rounded up to
+    0.5, 1, 2, 5, 10 m, it is the strength of the query: success within less than two of these is not scored. Evidence
+    is unknown until `segment` has made it. Priors are drawn as in the suites: the truth lies anywhere in the disc.
+
+    Raises
+    ------
+    ConfigError
+        If no picture is left, or the heights of the ground do not cover them.
+    ImageError
+        If there is no picture.
+    PoseError
+        If the table cannot be read.
+    StoreError
+        If the region is missing, or a folder cannot be written; nothing is half-written.
+    """
+    manifest, state = read_manifest(request.region), State.read(request.region)
+    found = _posed(request, manifest.epsg)
+    for one in list(found.pictures):
+        place_m = np.array([one.pose.easting_m, one.pose.northing_m])
+        if not state.is_mapped(place_m, one.side_m / math.sqrt(2)):  # in any heading
+            found.pictures.remove(one)
+            found.left_out[f"whose view is not wholly on the map {state.region}"].append(one.name)
+    _tell(found)
+    if not found.pictures:
+        reasons = "; ".join(f"{named(names, 'picture')} {why}" for why, names in found.left_out.items())
+        raise ConfigError(f"no picture of {request.pictures} can be asked: {reasons}")
+    writer = _Writer(request=request, manifest=manifest, state=state)
+    tasks = [writer.put(request.name, partial(writer.views, found.pictures), found.pictures)]
+    flights = flights_of([one for one in found.pictures if one.name not in writer.failed])
+    if flights:
+        flown = [one for flight in flights for one in flight]
+        tell(
+            f"{counted(len(flights), 'flight')} of {counted(len(flown), 'picture')}: a gap of {GAP_S:g} s ends one; "
+            f"the odometer drifts as {DRIFT} was measured to"
+        )
+        tasks.append(writer.put(f"{request.name}{FLIGHTS}", partial(writer.flights, flights), flown))
+    for why, names in writer.failed_by.items():
+        tell(f"left out: {named(names, 'picture')} {why}")
+    return tuple(tasks)
+
+
+def _posed(request: ImportRequest, epsg: int) -> PosedPictures:
+    table = None
+    if request.poses is not None:
+        facts = request.facts
+        if not facts.names and not facts.times_s:  # a TUM file's pictures: those of the folder, in their order
+            facts = replace(facts, names=tuple(names_of(list_pictures(request.pictures), request.pictures)))
+        table = read_pose_table(request.poses, facts)
+        for line in table.lines():
+            tell(line)
+    return pose_pictures(request.pictures, table, epsg=epsg, heights=request.heights, sigma_m=request.sigma_m)
+
+
+def _tell(found: PosedPictures) -> None:
+    for note in found.notes:
+        tell(note)
+    for why, names in found.left_out.items():
+        tell(f"left out: {named([plain(name) for name in names], 'picture', most=_SHOWN)} {why}")
+    lenses = lenses_of(found.pictures)
+    if len(lenses) > 1:
+        tell(f"{len(lenses)} cameras: {', '.join(f'{plain(lens)} ({count})' for lens, count in lenses.items())}")
+
+
+def flights_of(pictures: Sequence[PosedPicture]) -> list[list[PosedPicture]]:
+    """Return the flights among pictures, each in order of time, of `LEAST_FRAMES` at least.
+
+    A flight ends where the next picture is `GAP_S` later, is of another camera, or could not be reached in time.
+    """
+    timed = sorted((one for one in pictures if one.time_s is not None), key=lambda one: (one.time_s or 0.0, one.name))
+    found: list[list[PosedPicture]] = []
+    for one in timed:
+        last = found[-1][-1] if found else None
+        if last is None or not _follows(one, last):
+            found.append([one])
+        elif one.time_s != last.time_s:  # clocks of cameras count seconds: of two pictures in one the first is taken
+            found[-1].append(one)
+    return [flight for flight in found if len(flight) >= LEAST_FRAMES]
+
+
+def _follows(one: PosedPicture, last: PosedPicture) -> bool:
+    after_s = (one.time_s or 0.0) - (last.time_s or 0.0)
+    way_m = math.dist(one.position_m[:2], last.position_m[:2])
+    return after_s < GAP_S and one.lens == last.lens and way_m <= _FASTEST_MPS * max(after_s, 1.0)
+
+
+Pairs = Iterator[tuple[Query, Truth]]
+
+
+@dataclass(kw_only=True)
+class _Writer:
+    """Writes tasks; pictures that cannot be decoded are left out and counted."""
+
+    request: ImportRequest
+    manifest: Manifest
+    state: State
+    failed_by: "dict[str, list[str]]" = field(default_factory=dict)
+    labels: "dict[tuple[int, ...], FrameLabels]" = field(default_factory=dict)
+
+    @property
+    def failed(self) -> set[str]:
+        """Return the names of pictures that could not be decoded."""
+        return {name for names in self.failed_by.values() for name in names}
+
+    def put(
+        self, suite: str, pairs: Callable[[str], Iterator[tuple[Query, Truth]]], of: Sequence[PosedPicture]
+    ) -> Task:
+        """Write one task."""
+        made = put_task(pairs(suite), self._origin(suite, of), self._hidden(len(of)), out=self.request.out)
+        tell(f"{suite} on {self.state.region}: {counted(made.manifest.queries, 'query', 'queries')} in {made.folder}")
+        return made
+
+    def _hidden(self, count: int) -> TruthManifest:
+        return TruthManifest.model_validate(seed_record(self.request.seed) | {"count": count})
+
+    def _origin(self, suite: str, pictures: Sequence[PosedPicture]) -> TaskOrigin:
+        sigmas_m = [one.sigma_m for one in pictures]
+        by = "their files" if self.request.poses is None else self.request.poses.name
+        searched = self.request.group.words.removeprefix("searched: ")
+        return TaskOrigin(
+            suite=suite,
+            suite_version=_VERSION,
+            title=f"Pictures of one's own ({suite})",
+            what=f"{counted(len(pictures), 'picture')} with poses by {plain(by)}, searched: {searched}. Truths have a "
+            f"standard deviation of {min(sigmas_m):.1f} to {max(sigmas_m):.1f} m: success within less than two of "
+            "them, rounded up, is not scored.",
+            separates="What a method does on one's own pictures from what it does on others.",
+            falsifier="none",
+            strength_unit=TRUTH_SIGMA,
+            region=self.state.region,
+            map_date=self.state.date.isoformat(),
+            map_fingerprint=self.manifest.fingerprint,
+            map_inputs_sha256=self.manifest.inputs_sha256,
+            provenance=self.manifest.provenance,
+            sites=len(pictures),
+            epsg=self.manifest.epsg,
+            made_by=f"sasgeo-bench {version('sasgeo-bench')}",
+        )
+
+    def _seeds(self, suite: str) -> Seeds:
+        return Seeds(root=self.request.seed, names=(self.state.region, suite, str(_VERSION)))
+
+    def views(self, pictures: Sequence[PosedPicture], suite: str) -> Pairs:
+        """Yield each picture as a query of its own, in the order of the ids."""
+        seeds = {one.name: self._seeds(suite).under("picture", one.name) for one in pictures}
+        count = 0
+        for one in sorted(pictures, key=lambda one: seeds[one.name].digest("query")):
+            own = seeds[one.name]
+            prior = make_prior(one.pose, self.request.group, rng=own.rng("prior"))
+            pair = self._pair(one, suite, own.digest("query").hex()[:24], prior, own)
+            if pair is not None:
+                count += 1
+                yield pair
+        if not count:
+            reasons = "; ".join(f"{named(names, 'picture')} {why}" for why, names in self.failed_by.items())
+            raise ConfigError(f"no picture of {self.request.pictures} can be asked: {reasons}")
+
+    def flights(self, flights: Sequence[Sequence[PosedPicture]], suite: str) -> Pairs:
+        """Yield the pictures of flights in the order of the ids, with what an odometer says of the way to each."""
+        group = self.request.group
+        blank = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=group.scale_sigma)
+        by_id = {self._seeds(suite).digest("flight", one[0].name).hex()[:SEQUENCE_DIGITS]: one for one in flights}
+        for flight, pictures in sorted(by_id.items()):
+            seeds = self._seeds(suite).under("flight", pictures[0].name)
+            flown = _trajectory(pictures)
+            steps = draw_odometry(flown, load_profile(DRIFT), rng=seeds.rng("odometry"))
+            for frame, one in enumerate(pictures):
+                prior = make_prior(one.pose, group, rng=seeds.rng("prior")) if frame == 0 else blank
+                told = {
+                    "distance_m": round(float(flown.distance_m[frame]), 1),
+                    "time_s": round(float(flown.time_s[frame]), 2),
+                    "is_seen": 1.0,
+                }
+                step = _step(flight, frame, steps)
+                pair = self._pair(one, suite, view_id(flight, frame), prior, seeds, step=step, told=told)
+                if pair is not None:
+                    yield pair
+
+    def _pair(
+        self,
+        one: PosedPicture,
+        suite: str,
+        query_id: str,
+        prior: Prior,
+        seeds: Seeds,
+        *,
+        step: Step | None = None,
+        told: Mapping[str, float] = MappingProxyType({}),
+    ) -> tuple[Query, Truth] | None:
+        """Return the query and truth of a picture; None, and the reason kept, if it cannot be decoded."""
+        try:
+            sight = see(one.picture)
+            image = _small(sight.image)
+            east_m, north_m = sight.middle_m
+            height_m = 0.0 if one.picture.camera is None else one.position_m[2]
+            frame = Frame(
+                picture=encode_webp(image.rgb),
+                camera=image.camera.moved(east_m=-east_m, north_m=-north_m),
+                height_sigma_m=round(height_m * one.picture.scale_sigma, 2),
+                attitude_sigma_deg=1.0 if one.picture.camera is not None else 0.0,
+            )
+        except SasgeoError as error:
+            self.failed_by.setdefault(f"that cannot be decoded ({plain(str(error))[:120]})", []).append(one.name)
+            return None
+        state, group = self.state, self.request.group
+        size_cells = sight.size_cells // _CELLS * _CELLS
+        evidence = unseen(state.classes, size_cells, sight.cell_size_m)
+        taken = one.picture.taken_at
+        query = Query(
+            query_id=query_id,
+            track="localization" if step is None else "sequence",
+            suite=suite,
+            suite_version=_VERSION,
+            part="test",
+            region=state.region,
+            prior_group=group.name,
+            evidence=evidence,
+            observed_on=state.date if taken is None else taken.date(),
+            season="",
+            prior=prior,
+            frames=(frame,),
+            step=step,
+        )
+        density = self._density(one, evidence)
+        block = "-".join(str(math.floor(value / _BLOCK_M)) for value in (one.pose.easting_m, one.pose.northing_m))
+        truth = Truth(
+            query_id=query_id,
+            is_present=True,
+            pose=one.pose,
+            candidate=-1,
+            pair_id=seeds.digest("pair", one.name).hex()[:16],
+            role="control",
+            kind="own picture",
+            strength=next((step for step in _STEPS_M if step >= one.sigma_m), one.sigma_m),
+            strength_unit=TRUTH_SIGMA,
+            unknown_share=evidence.unknown_share,
+            changed_share=0.0,
+            feature_density=density,
+            alias_index=None,
+            block=f"{state.region}-{block}",
+            scene=",".join(self.manifest.scenes),
+            measured={
+                "truth_sigma_m": one.sigma_m,
+                "height_m": round(height_m, 1),
+                "tilt_deg": round(one.picture.tilt_deg, 1),
+                **told,
+                **({UNANSWERABLE: 1.0} if density < LEAST_DRAWN else {}),
+            },
+            detector=REAL,
+            labels=(self._labels(image),),
+        )
+        return query, truth
+
+    def _density(self, one: PosedPicture, evidence: Evidence) -> float:
+        """Return the share of a view's cells in which the map shows a road, building, water or other drawn feature."""
+        view = self.state.view(one.pose, size_cells=evidence.shape[0], cell_size_m=evidence.cell_size_m)
+        layers = [view.classes.index(name) for name in (*DRAWN_CLASSES, "water") if name in view.classes]
+        return float((view.cells[layers] == PRESENT).any(axis=0).mean())
+
+    def _labels(self, image: AerialImage) -> FrameLabels:
+        """Return labels that say nothing: what is on one's own pictures no one has drawn."""
+        shape = (len(self.state.classes), *image.rgb.shape[:2])
+        if shape not in self.labels:
+            self.labels[shape] = FrameLabels.of(self.state.classes, np.full(shape, UNKNOWN, dtype=np.uint8))
+        return self.labels[shape]
+
+
+def _trajectory(pictures: Sequence[PosedPicture]) -> Trajectory:
+    """Return the way of the middles of views, as an odometer of the views sees it."""
+    begin_s = pictures[0].time_s or 0.0
+    return Trajectory.of_angles(
+        time_s=[(one.time_s or 0.0) - begin_s for one in pictures],
+        position_m=[[one.pose.easting_m, one.pose.northing_m, one.position_m[2]] for one in pictures],
+        yaw_deg=[one.pose.yaw_deg for one in pictures],
+    )
+
+
+def _step(flight: str, frame: int, steps: Odometry) -> Step:
+    if frame == 0 or steps.is_lost[frame - 1]:
+        return Step(sequence_id=flight, frame=frame)
+    at = frame - 1
+    return Step(
+        sequence_id=flight,
+        frame=frame,
+        increment=(float(steps.right_m[at]), float(steps.up_m[at]), float(steps.yaw_deg[at])),
+        covariance=tuple(steps.covariance[at].ravel().tolist()),
+    )
+
+
+def _small(image: AerialImage) -> AerialImage:
+    """Return a picture of `_MOST_PX` a side at most, by averages of whole pixels."""
+    factor = math.ceil(max(image.rgb.shape[:2]) / _MOST_PX)
+    if factor < 2:
+        return image
+    rows, cols = (side // factor for side in image.rgb.shape[:2])
+    rgb = cv2.resize(image.rgb[: rows * factor, : cols * factor], (cols, rows), interpolation=cv2.INTER_AREA)
+    lens = image.camera.intrinsics
+    lens = replace(
+        lens,
+        width_px=cols,
+        height_px=rows,
+        focal_px=(lens.focal_px[0] / factor, lens.focal_px[1] / factor),
+        centre_px=(lens.centre_px[0] / factor, lens.centre_px[1] / factor),
+    )
+    return replace(image, rgb=np.ascontiguousarray(rgb), camera=replace(image.camera, intrinsics=lens))

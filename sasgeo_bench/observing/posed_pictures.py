@@ -1,0 +1,382 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of a user's own with the pose of each in the CRS of a map, from their files, a table and heights."""
+
+import datetime as dt
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import rasterio
+from PIL import ExifTags, Image
+from rasterio.errors import RasterioError
+
+from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError, counted
+from sasgeo_bench.core.texts import plain
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, rotation
+from sasgeo_bench.observing.picture_poses import PicturePose, PoseTable
+from sasgeo_bench.observing.pictures import (
+    LEAST_M,
+    STEEPEST_DEG,
+    OwnPicture,
+    grid_place,
+    largest_square,
+    list_pictures,
+    names_of,
+    open_picture,
+    see,
+)
+from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
+from sasgeo_bench.sensing.photos import DJI, Photo, number_of, read_head, read_photo
+
+GPS_SIGMA_M: Final = 3.3  # of one axis: 95 % within 8 m, as the GPS performance standard of 2020 states it
+_TILT_SIGMA: Final = 0.0175  # metres to a metre of height: a gimbal is right to a degree
+_MOST_BYTES: Final = 64 * 2**20
+_CELL_M: Final = 10.0  # of the lattice of heights; GLO-30 and SRTM have 30 m
+_AROUND_M: Final = 400.0  # of ground around the cameras whose heights are read
+
+
+@dataclass(frozen=True, kw_only=True)
+class Heights:
+    """How high cameras were above the ground, where that is not what their files say.
+
+    One of them at most is given: a height above the ground of all pictures; heights of the ground, a GeoTIFF; or the
+    altitude of the place of take-off. Raise `ConfigError` otherwise.
+    """
+
+    height_m: float | None = None
+    dem: Path | None = None
+    takeoff_m: float | None = None
+
+    def __post_init__(self) -> None:
+        if sum(value is not None for value in (self.height_m, self.dem, self.takeoff_m)) > 1:
+            raise ConfigError("heights come from one source: give --height, --dem or --takeoff-height alone")
+        if self.height_m is not None and not 0 < self.height_m <= 10_000:
+            raise ConfigError(f"--height lies above 0 and within 10000 m, got {self.height_m!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosedPicture:
+    """A picture whose pose is known.
+
+    Parameters
+    ----------
+    name : str
+        By which messages call it.
+    picture : OwnPicture
+        Its camera above the origin, the picture's up being north.
+    pose : Pose
+        Of the middle of its view on the map, with the picture's up for its heading.
+    sigma_m : float
+        Standard deviation of that place along one axis, metres.
+    position_m : tuple of float
+        Easting, northing and height above the ground of the camera, metres.
+    side_m : float
+        Of the view.
+    time_s : float, optional
+        Seconds since 1970, by the camera's clock or the table's.
+    lens : str
+        What tells cameras apart: model and size.
+    """
+
+    name: str
+    picture: OwnPicture
+    pose: Pose
+    sigma_m: float
+    position_m: tuple[float, float, float]
+    side_m: float
+    time_s: float | None = None
+    lens: str = ""
+
+
+@dataclass(kw_only=True)
+class PosedPictures:
+    """Pictures with poses in the order of their names, and the others by reason; `notes` are lines for the user."""
+
+    pictures: list[PosedPicture] = field(default_factory=list)
+    left_out: "defaultdict[str, list[str]]" = field(default_factory=lambda: defaultdict(list))
+    notes: list[str] = field(default_factory=list)
+
+
+def pose_pictures(
+    folder: Path, table: PoseTable | None, *, epsg: int, heights: Heights, sigma_m: float | None = None
+) -> PosedPictures:
+    """Return the pictures of a folder with their poses in a projected CRS; no pixel of a photo is decoded.
+
+    Parameters
+    ----------
+    folder : Path
+        Of photos and georeferenced pictures.
+    table : PoseTable, optional
+        Poses that replace what photos say of themselves, as far as it has them.
+    epsg : int
+        CRS of a map.
+    heights : Heights
+        Where heights above the ground come from.
+    sigma_m : float, optional
+        Standard deviation of places, for all pictures whose file or row does not state it.
+
+    Raises
+    ------
+    ConfigError
+        If the ground's heights do not cover the pictures.
+    ImageError
+        If there is no picture. A picture that has no pose is left out, with its reason.
+    """
+    found = PosedPictures()
+    paths = list_pictures(folder)
+    seen: list[_Stand] = []
+    for path, name in zip(paths, names_of(paths, folder), strict=True):
+        try:
+            if path.suffix.lower() in (".tif", ".tiff"):
+                picture = open_picture(path) if _is_georeferenced(path) else None
+                if picture is not None and picture.position_by == "georeference":
+                    found.pictures.append(_from_above(picture, name, epsg, sigma_m))
+                    continue
+            row = None if table is None else table.find(name)
+            if table is not None and row is None:
+                found.left_out["that the table does not name"].append(name)
+                continue
+            stand = _stand(path, name, row, epsg, sigma_m)
+        except SasgeoError as error:
+            found.left_out[f"that cannot be read ({_reason(error, name)})"].append(name)
+            continue
+        if isinstance(stand, str):
+            found.left_out[stand].append(name)
+        else:
+            seen.append(stand)
+    found.notes += _clocks(seen)
+    ground = _ground(heights, seen, epsg, found) if seen else None
+    for stand in seen:
+        posed = _posed(stand, heights, ground)
+        if isinstance(posed, str):
+            found.left_out[posed].append(stand.name)
+        else:
+            found.pictures.append(posed)
+    found.pictures.sort(key=lambda one: one.name)
+    return found
+
+
+def _reason(error: SasgeoError, name: str) -> str:
+    """Return the text of an error without the name of its picture, so that like faults are counted together."""
+    return plain(str(error)).replace(name, "it").replace(name.rpartition("/")[2], "it")[:160]
+
+
+def _is_georeferenced(path: Path) -> bool:
+    try:
+        with rasterio.open(path) as source:
+            return source.crs is not None and not source.transform.is_identity
+    except RasterioError:
+        return False
+
+
+def _from_above(picture: OwnPicture, name: str, epsg: int, sigma_m: float | None) -> PosedPicture:
+    """Return a georeferenced picture, which is seen from straight above."""
+    assert picture.lonlat is not None  # noqa: S101 - by its georeference
+    east_m, north_m, convergence_deg = grid_place(*picture.lonlat, epsg)
+    yaw_deg = ((picture.heading_deg or 0.0) + convergence_deg) % 360.0
+    return PosedPicture(
+        name=name,
+        picture=picture,
+        pose=Pose(easting_m=east_m, northing_m=north_m, yaw_deg=yaw_deg),
+        sigma_m=GPS_SIGMA_M if sigma_m is None else sigma_m,
+        position_m=(east_m, north_m, 0.0),
+        side_m=see(picture).side_m,
+        lens=f"georeferenced, pixels of {picture.gsd_m or 0.0:.2f} m",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Stand:
+    """A photo before its height above the ground is known."""
+
+    path: Path
+    name: str
+    photo: Photo
+    row: PicturePose | None
+    place_m: tuple[float, float]
+    sigma_m: float
+    epsg: int
+
+    @property
+    def altitude(self) -> tuple[float | None, str]:
+        if self.row is not None and self.row.altitude_m is not None:
+            return self.row.altitude_m, self.row.altitude_of
+        return self.photo.altitude_m, "sea"
+
+    @property
+    def exif_s(self) -> float | None:
+        taken = self.photo.taken_at
+        return None if taken is None else taken.replace(tzinfo=dt.UTC).timestamp()
+
+    @property
+    def height_m(self) -> float | None:
+        return self.photo.height_m if self.row is None or self.row.height_m is None else self.row.height_m
+
+    def camera(self, height_m: float) -> Camera:
+        lens = None if self.row is None else self.row.intrinsics
+        camera = self.photo.camera(epsg=self.epsg, height_m=height_m, intrinsics=lens)
+        # A place in another datum came straight to the map's CRS.
+        return camera.moved(east_m=self.place_m[0] - camera.east_m, north_m=self.place_m[1] - camera.north_m)
+
+
+def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: float | None) -> _Stand | str:
+    """Return where a photo was taken, or why that is not known."""
+    photo, of_file_m = _photo(path)
+    if row is not None:
+        if row.attitude is not None and photo.orientation != 1:
+            return "that EXIF turns, so that the table's angles may be of another picture"
+        lon, lat = row.lonlat
+        photo = replace(photo, lon_deg=lon, lat_deg=lat)
+        if row.attitude is not None:
+            photo = replace(photo, gimbal=row.attitude, gimbal_fault="")
+    if photo.lon_deg is None or photo.lat_deg is None:
+        return "without a position"
+    if photo.gimbal is None:
+        return "without angles of the camera"
+    place_m = grid_place(photo.lon_deg, photo.lat_deg, epsg)[:2] if row is None else row.in_crs(epsg)
+    stated = of_file_m if row is None else row.sigma_m
+    stated = sigma_m if stated is None else stated
+    return _Stand(
+        path=path,
+        name=name,
+        photo=photo,
+        row=row,
+        place_m=place_m,
+        sigma_m=GPS_SIGMA_M if stated is None else stated,
+        epsg=epsg,
+    )
+
+
+def _photo(path: Path) -> tuple[Photo, float | None]:
+    """Return what a file says of its picture, and the standard deviation of its place if it states one."""
+    if path.suffix.lower() in (".png", ".webp"):
+        try:
+            with Image.open(path, formats=("PNG", "WEBP")) as image:
+                return Photo(name=path.name, width_px=image.width, height_px=image.height), None
+        except (OSError, Image.DecompressionBombError) as error:
+            raise ImageError(f"{path.name} is no sound picture: copy it again") from error
+    head = read_head(path)
+    spreads = [number_of(head.xmp.get((DJI, f"RtkStd{axis}"))) for axis in ("Lon", "Lat")]
+    known = [value for value in spreads if value is not None and value > 0]
+    sigma_m = max(known) if len(known) == 2 else number_of(head.gps.get(ExifTags.GPS.GPSHPositioningError))
+    return read_photo(path, most_bytes=_MOST_BYTES), sigma_m if sigma_m is not None and sigma_m > 0 else None
+
+
+def _clocks(seen: Sequence[_Stand]) -> list[str]:
+    """Return a line where a table has other times than the photos themselves, both by a local clock."""
+    off_s = [
+        stand.row.time_s - stand.exif_s
+        for stand in seen
+        if stand.row is not None and stand.row.clock == "local" and stand.row.time_s and stand.exif_s is not None
+    ]
+    odd = [value for value in off_s if abs(value) > 1.0]  # EXIF counts seconds
+    if not odd:
+        return []
+    off = f"{float(np.median(odd)):+.0f} s (median) off EXIF at {len(odd)} of {counted(len(off_s), 'picture')}"
+    return [f"clocks disagree: the table is {off}; the table's times are taken"]
+
+
+def _ground(heights: Heights, seen: Sequence[_Stand], epsg: int, found: PosedPictures) -> Dem | None:
+    """Read the heights of the ground around all cameras, and say what they count from."""
+    if heights.dem is None:
+        return None
+    places = np.array([stand.place_m for stand in seen])
+    low, high = places.min(axis=0) - _AROUND_M, places.max(axis=0) + _AROUND_M
+    grid = Grid.from_bounds(*low.tolist(), *high.tolist(), cell_size_m=_CELL_M, epsg=epsg)
+    try:
+        dem = read_dem(heights.dem, grid)
+    except CameraError as error:
+        raise ConfigError(str(error)) from error
+    found.notes.append(
+        f"heights of the ground by {heights.dem.name}, taken to be above the sea as GLO-30 (EGM2008) and SRTM (EGM96) "
+        "are; altitudes of the pictures as well: they may differ by the receiver's own geoid"
+    )
+    return dem
+
+
+def _posed(stand: _Stand, heights: Heights, dem: Dem | None) -> PosedPicture | str:
+    """Return a photo with the pose of its view, or why it has none."""
+    height_m = _height(stand, heights, dem, stand.place_m)
+    if isinstance(height_m, str):
+        return height_m
+    for _ in range(3 if dem is not None else 1):  # the ground of the view lies beside that beneath the camera
+        if not height_m > 0:
+            return "that were not above the ground"
+        try:
+            camera = stand.camera(height_m)
+        except CameraError as error:
+            return f"whose camera is not known ({_reason(error, stand.name)})"
+        if camera.tilt_deg > STEEPEST_DEG:
+            return f"that look more than {STEEPEST_DEG:g} degrees away from straight down"
+        above = _above_origin(camera)
+        middle_m, side_m = largest_square(above.footprint(Plane()))
+        if side_m < LEAST_M:
+            return f"that show less ground than {LEAST_M:g} m a side"
+        here = Pose(easting_m=camera.east_m, northing_m=camera.north_m, yaw_deg=camera.yaw_deg)
+        east_m, north_m = here.to_map(np.array([middle_m]))[0].tolist()
+        if dem is not None:
+            found_m = _height(stand, heights, dem, (east_m, north_m))
+            height_m = found_m if isinstance(found_m, float) else height_m
+    sigma_m = float(np.hypot(stand.sigma_m, _TILT_SIGMA * camera.height_m))
+    photo, row = stand.photo, stand.row
+    return PosedPicture(
+        name=stand.name,
+        picture=OwnPicture(
+            path=stand.path,
+            lonlat=(photo.lon_deg, photo.lat_deg),  # type: ignore[arg-type]
+            position_by="EXIF" if row is None else "table",
+            scale_sigma=0.03 if dem is not None or heights.height_m is not None else 0.10,
+            taken_at=photo.taken_at,
+            camera=above,
+            height_m=camera.height_m,
+        ),
+        pose=replace(here, easting_m=east_m, northing_m=north_m),
+        sigma_m=round(sigma_m, 2),
+        position_m=(camera.east_m, camera.north_m, camera.height_m),
+        side_m=side_m,
+        time_s=row.time_s if row is not None and row.time_s is not None else stand.exif_s,
+        lens=f"{photo.model or 'camera'} {photo.width_px} x {photo.height_px}",
+    )
+
+
+def _height(stand: _Stand, heights: Heights, dem: Dem | None, at_m: tuple[float, float]) -> float | str:
+    """Return the height of a camera above the ground of a place, metres, or why it is not known."""
+    if heights.height_m is not None:
+        return heights.height_m
+    altitude_m, of = stand.altitude
+    if dem is None and heights.takeoff_m is None:
+        return (
+            "whose height above the ground is not known (say --height, --dem or --takeoff-height)"
+            if (stand.height_m is None)
+            else stand.height_m
+        )
+    if altitude_m is None:
+        return "without an altitude"
+    if heights.takeoff_m is not None:
+        return altitude_m - heights.takeoff_m
+    if of == "ellipsoid":
+        return "whose altitude counts from the ellipsoid, where the ground's heights do from the sea: convert it"
+    assert dem is not None  # noqa: S101 - one of both
+    ground_m = float(dem.heights_m(np.array([at_m]))[0])
+    return altitude_m - ground_m if np.isfinite(ground_m) else "beyond the heights of the ground"
+
+
+def _above_origin(camera: Camera) -> Camera:
+    """Return a camera above the origin, in axes in which its picture's up is north."""
+    turn = np.eye(3)
+    turn[:2, :2] = rotation(camera.yaw_deg)
+    a, b, c, d, e, f, g, h, i = (camera.matrix @ turn).ravel().round(15).tolist()
+    return replace(camera, east_m=0.0, north_m=0.0, rotation=(a, b, c, d, e, f, g, h, i))
+
+
+def lenses_of(pictures: Sequence[PosedPicture]) -> Mapping[str, int]:
+    """Return the cameras of some pictures with how many each took, most first."""
+    counts: defaultdict[str, int] = defaultdict(int)
+    for one in pictures:
+        counts[one.lens] += 1
+    return dict(sorted(counts.items(), key=lambda item: -item[1]))

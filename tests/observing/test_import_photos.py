@@ -1,0 +1,490 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Own pictures as tasks: truths, priors, flights, heights over a slope, and pictures that are left out."""
+
+import math
+from dataclasses import replace
+from itertools import islice, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
+from pyproj import Transformer
+from rasterio.transform import from_origin
+
+import sasgeo_bench as sgb
+from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, StoreError
+from sasgeo_bench.core.progress import reporting
+from sasgeo_bench.observing.import_photos import ImportRequest, flights_of, import_photos
+from sasgeo_bench.observing.pictures import OwnPicture
+from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights, PosedPicture
+from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
+from sasgeo_bench.sensing.crops import drawn_crops
+from sasgeo_bench.tasks.query import TRUTH_SIGMA
+from sasgeo_bench.tasks.task_files import Task
+from tests import pose_files
+from tests.sensing.test_photos import write_photo, xmp_of
+
+TOWN = "town-riverside"
+WIDTH, HEIGHT, FILM_MM = 480, 360, 24.0
+FOCAL = FILM_MM * math.hypot(WIDTH, HEIGHT) / math.hypot(36.0, 24.0)
+HEAD = (
+    *("file", "lon", "lat", "RelativeAltitude", "gimbal_yaw", "gimbal_pitch", "gimbal_roll", "DateTimeOriginal"),
+    *("ImageWidth", "ImageHeight", "FocalLengthIn35mmFormat", "horizontal_accuracy"),
+)
+
+
+@pytest.fixture(scope="module")
+def region(towns: Path) -> sgb.Region:
+    return sgb.read_region(towns / "regions" / TOWN)
+
+
+@pytest.fixture(scope="module")
+def middle(region) -> tuple[float, float]:
+    west, south, east, north = region.grid.bounds_m
+    return ((west + east) / 2, (south + north) / 2)
+
+
+def lonlat(region, east, north):
+    return Transformer.from_crs(region.grid.epsg, 4326, always_xy=True).transform(east, north)
+
+
+def north_of_grid(region, east, north):
+    """Bearing of true north in the grid at a place."""
+    lon, lat = lonlat(region, east, north)
+    back = Transformer.from_crs(4326, region.grid.epsg, always_xy=True)
+    x, y = back.transform(lon, lat + 1e-3)
+    return math.degrees(math.atan2(x - east, y - north))
+
+
+def row(region, name, place, **more):
+    """A row of a table: angles are against true north, the place is in the CRS of the region."""
+    usual = {
+        "height": 80.0,
+        "angles": (0.0, -90.0, 0.0),
+        "time": "",
+        "size": (WIDTH, HEIGHT),
+        "film": FILM_MM,
+        "sigma": "",
+    }
+    told = usual | more
+    lon, lat = lonlat(region, *place)
+    cells = [name, f"{lon:.10f}", f"{lat:.10f}", told["height"], *told["angles"], told["time"], *told["size"]]
+    return ",".join(map(str, [*cells, told["film"], told["sigma"]]))
+
+
+@pytest.fixture
+def laid(towns, tmp_path):
+    """Lay pictures of noise with a table of their poses; return what imports them."""
+
+    def lay(rows, *, without=(), out=None, **options):
+        folder = tmp_path / "photos"
+        folder.mkdir(exist_ok=True)
+        rng = np.random.default_rng(3)
+        for line in rows:
+            name = line.split(",")[0]
+            if name not in without:
+                noise = rng.integers(0, 256, (HEIGHT // 8, WIDTH // 8, 3), dtype=np.uint8)
+                Image.fromarray(noise).resize((WIDTH, HEIGHT)).save(folder / name)
+        table = tmp_path / "poses.csv"
+        table.write_text("\n".join([",".join(HEAD), *rows]) + "\n")
+        given = {"poses": table, "out": out or tmp_path / "out"} | options
+        return ImportRequest(pictures=folder, region=towns / "regions" / TOWN, **given)
+
+    return lay
+
+
+def asked(task):
+    """Queries and truths of a task by id."""
+    truths = {truth.query_id: truth for truth in task.truths}
+    return [(query, truths[query.query_id]) for query in task.queries()]
+
+
+def quiet(request):
+    lines = []
+    with reporting(lines.append):
+        tasks = import_photos(request)
+    return tasks, lines
+
+
+def offset(middle, east, north):
+    return (middle[0] + east, middle[1] + north)
+
+
+def camera_of(region, place, height, angles):
+    """Plain numpy: position and rows right, down, ahead of a camera in the grid's east, north, up."""
+    lean = north_of_grid(region, *place)
+    return np.array([*place, height]), pose_files.camera(*angles) @ pose_files.about(2, lean)
+
+
+def project(position, turn, point):
+    """Pixel of a point by a pinhole in the middle of the picture."""
+    x, y, ahead = turn @ (np.asarray(point) - position)
+    return np.array([WIDTH / 2 + FOCAL * x / ahead, HEIGHT / 2 + FOCAL * y / ahead])
+
+
+def test_drawn_crops_get_the_poses_at_which_they_were_drawn(region, laid, tmp_path):
+    """Each is the picture of a camera straight above, so high that its pixels are as wide."""
+    rows, poses = [], {}
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for at, crop in enumerate(islice(drawn_crops([region], seed=7, side_px=200, pixel_m=0.5, zoom=1.2), 8)):
+        name, film = f"crop {at}.png", 24.0
+        Image.fromarray(crop.rgb).save(folder / name)
+        place = (crop.pose.easting_m, crop.pose.northing_m)
+        height = crop.pixel_m * film * math.hypot(200, 200) / math.hypot(36.0, 24.0)
+        yaw = crop.pose.yaw_deg - north_of_grid(region, *place)
+        rows.append(row(region, name, place, height=height, angles=(yaw, -90.0, 0.0), size=(200, 200), film=film))
+        poses[height] = crop.pose
+    request = laid(rows, without={line.split(",")[0] for line in rows})
+    tasks, lines = quiet(request)
+    pairs = asked(tasks[0])
+    assert len(tasks) == 1  # without times there is no flight
+    assert len(pairs) >= 5  # some reach beyond the map, which is said
+    assert len(pairs) == 8 or any("not wholly on the map" in line for line in lines)
+    for query, truth in pairs:
+        crop_pose = poses[min(poses, key=lambda height: abs(height - truth.measured["height_m"]))]
+        assert truth.pose.easting_m == pytest.approx(crop_pose.easting_m, abs=0.01)
+        assert truth.pose.northing_m == pytest.approx(crop_pose.northing_m, abs=0.01)
+        assert abs((truth.pose.yaw_deg - crop_pose.yaw_deg + 180) % 360 - 180) < 0.01
+        assert query.frames[0].camera.intrinsics.width_px == 200
+        assert (query.track, query.suite, query.prior_group) == ("localization", "photos", "r500-weak-s10")
+        assert query.evidence.unknown_share == 1.0
+        assert (truth.detector, truth.is_present, truth.block[: len(TOWN)]) == ("real", True, TOWN)
+
+
+def test_the_truth_lies_anywhere_in_the_disc(region, middle, laid):
+    rows = [row(region, f"{at}.png", offset(middle, at, -at)) for at in range(12)]
+    (task,), _ = quiet(laid(rows))
+    off = [
+        math.dist(query.prior.center_m, (truth.pose.easting_m, truth.pose.northing_m)) for query, truth in asked(task)
+    ]
+    assert max(off) <= 500.0
+    assert min(off) > 5.0
+    assert np.std(off) > 50.0
+    first = [query.prior for query in task.queries()]
+    assert first != [query.prior for query in quiet(laid(rows, seed=1))[0][0].queries()]
+    assert first == [query.prior for query in quiet(laid(rows))[0][0].queries()]
+
+
+@pytest.mark.parametrize("angles", [(0.0, -90.0, 0.0), (37.0, -75.0, 5.0), (200.0, -62.0, -8.0)])
+def test_the_middle_of_a_view_is_seen_at_the_same_pixel_from_its_truth(angles, region, middle, laid):
+    (task,), _ = quiet(laid([row(region, "a.png", middle, angles=angles)]))
+    ((query, truth),) = asked(task)
+    camera = query.frames[0].camera
+    seen = camera.project(np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0], [10.0, 0.0, 0.0]]))
+    points = truth.pose.to_map(np.array([[0.0, 0.0], [0.0, 10.0], [10.0, 0.0]]))
+    position, turn = camera_of(region, middle, 80.0, angles)
+    scale = FOCAL / camera.intrinsics.focal_px[0]
+    shown = [project(position, turn, [*point, 0.0]) for point in points]
+    # The frame is a part of the picture: distances between the points are alike, as are turns.
+    np.testing.assert_allclose((seen[1:] - seen[0]) * scale, np.array(shown[1:]) - shown[0], atol=0.01)
+    assert truth.measured["tilt_deg"] == pytest.approx(90 + angles[1], abs=8.1)
+
+
+def slope(region, middle, path, *, degrees, base=200.0):
+    """Heights that rise to the east, 200 m in the middle of the town."""
+    west, north = middle[0] - 1500, middle[1] + 1500
+    rise = math.tan(math.radians(degrees))
+    cells = base + rise * (np.arange(300) * 10.0 + 5.0 - 1500.0)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=300, height=300, count=1, dtype="float32",
+        crs=f"EPSG:{region.grid.epsg}", transform=from_origin(west, north, 10.0, 10.0),
+    ) as out:  # fmt: skip
+        out.write(np.tile(cells.astype(np.float32), (300, 1)), 1)
+    return path, rise
+
+
+def absolute(line, altitude):
+    """A row with an altitude above the sea in place of the height above take-off."""
+    cells = line.split(",")
+    cells[3] = str(altitude)
+    return ",".join(cells)
+
+
+@pytest.mark.parametrize("angles", [(90.0, -90.0, 0.0), (90.0, -80.0, 0.0), (270.0, -75.0, 0.0), (45.0, -70.0, 0.0)])
+def test_a_slope_of_20_degrees_moves_no_truth_by_2_metres(angles, region, middle, laid, tmp_path):
+    dem, rise = slope(region, middle, tmp_path / "dem.tif", degrees=20.0)
+    request = laid([absolute(row(region, "a.png", middle, angles=angles), 280.0)], heights=Heights(dem=dem))
+    request.poses.write_text(request.poses.read_text().replace("RelativeAltitude", "AbsoluteAltitude"))
+    (task,), lines = quiet(request)
+    ((query, truth),) = asked(task)
+    assert any("taken to be above the sea" in line for line in lines)
+    # The pixel that the middle of the view has, and where its ray meets the slope.
+    position, _ = camera_of(region, middle, 280.0, angles)
+    here = np.array([truth.pose.easting_m, truth.pose.northing_m])
+    height = truth.measured["height_m"]
+    flat = np.array([*here, 280.0 - height])
+    ray = flat - position
+    along = (200.0 + rise * (position[0] - middle[0]) - position[2]) / (ray[2] - rise * ray[0])
+    met = position + along * ray
+    assert np.linalg.norm(met[:2] - here) < 2.0
+    assert height == pytest.approx(280.0 - (200.0 + rise * (here[0] - middle[0])), abs=0.2)
+    assert query.frames[0].height_sigma_m > 0
+
+
+def test_heights_come_from_where_the_user_says(region, middle, laid):
+    line = row(region, "a.png", middle)
+    heights = {}
+    for name, given in {"own": Heights(), "stated": Heights(height_m=60.0)}.items():
+        (task,), _ = quiet(laid([line], heights=given))
+        heights[name] = task.truths[0].measured["height_m"]
+    request = laid([absolute(line, 500.0)], heights=Heights(takeoff_m=430.0))
+    request.poses.write_text(request.poses.read_text().replace("RelativeAltitude", "AbsoluteAltitude"))
+    heights["take-off"] = quiet(request)[0][0].truths[0].measured["height_m"]
+    assert heights == {"own": 80.0, "stated": 60.0, "take-off": 70.0}
+
+
+def test_the_truth_says_how_far_it_is_off(region, middle, laid):
+    rows = [row(region, "gps.png", middle), row(region, "rtk.png", middle, sigma="0.02")]
+    (task,), _ = quiet(laid(rows))
+    found = sorted(truth.measured["truth_sigma_m"] for truth in task.truths)
+    # A degree of tilt at 80 m is 1.4 m beside the place of the camera.
+    assert found == pytest.approx([math.hypot(0.02, 1.4), math.hypot(GPS_SIGMA_M, 1.4)], abs=0.01)
+    assert {truth.strength_unit for truth in task.truths} == {TRUTH_SIGMA}
+    assert sorted(truth.strength for truth in task.truths) == [2.0, 5.0]
+    assert "1.4 to 3.6 m: success within less than two of them, rounded up" in task.manifest.what
+    (task,), _ = quiet(laid(rows, sigma_m=0.5))
+    assert min(truth.measured["truth_sigma_m"] for truth in task.truths) == pytest.approx(
+        math.hypot(0.02, 1.4), abs=0.01
+    )
+    assert max(truth.measured["truth_sigma_m"] for truth in task.truths) == pytest.approx(
+        math.hypot(0.5, 1.4), abs=0.01
+    )
+
+
+def clock(seconds):
+    return f"2025:10:02 12:{seconds // 60:02}:{seconds % 60:02}"
+
+
+def test_pictures_that_follow_each_other_are_flights(region, middle, laid):
+    times = [0, 2, 4, 6, 50, 52, 54, 200]  # four, three, and one alone
+    rows = [
+        row(region, f"{at}.png", offset(middle, 10 * at, 0), time=clock(second), angles=(90.0, -90.0, 0.0))
+        for at, second in enumerate(times)
+    ]
+    tasks, lines = quiet(laid(rows))
+    assert [task.manifest.suite for task in tasks] == ["photos", "photos-flights"]
+    assert any(line.startswith("2 flights of 7 pictures: a gap of 30 s ends one") for line in lines)
+    flights = {}
+    for query, truth in asked(tasks[1]):
+        flights.setdefault(query.step.sequence_id, []).append((query, truth))
+    assert sorted(map(len, flights.values())) == [3, 4]
+    for pairs in flights.values():
+        assert [query.step.frame for query, _ in pairs] == list(range(len(pairs)))
+        assert [query.prior.has_place for query, _ in pairs] == [True] + [False] * (len(pairs) - 1)
+        for (_, before), (query, truth) in pairwise(pairs):
+            right, up, turn = query.step.increment
+            assert (right, up, turn) == (pytest.approx(0, abs=2), pytest.approx(10, abs=2), pytest.approx(0, abs=5))
+            assert truth.measured["distance_m"] - before.measured["distance_m"] == pytest.approx(10.0, abs=0.2)
+            assert truth.measured["time_s"] - before.measured["time_s"] == 2.0
+
+
+def posed(name, time_s, east=0.0, lens="x"):
+    picture = OwnPicture(path=Path(name), scale_sigma=0.1)
+    pose = sgb.Pose(easting_m=east, northing_m=0.0, yaw_deg=0.0)
+    return PosedPicture(
+        name=name,
+        picture=picture,
+        pose=pose,
+        sigma_m=1.0,
+        position_m=(east, 0.0, 80.0),
+        side_m=50.0,
+        time_s=time_s,
+        lens=lens,
+    )
+
+
+def test_a_flight_ends_at_a_gap_another_camera_or_a_leap():
+    gap = [posed(str(at), time) for at, time in enumerate([0.0, 10.0, 20.0, 50.0, 60.0, 89.9])]
+    assert [[one.name for one in flight] for flight in flights_of(gap)] == [["0", "1", "2"], ["3", "4", "5"]]
+    lenses = [posed(str(at), float(at), lens="ab"[at > 2]) for at in range(6)]
+    assert [len(flight) for flight in flights_of(lenses)] == [3, 3]
+    leap = [posed(str(at), float(at), east=1000.0 * (at > 2)) for at in range(5)]
+    assert [len(flight) for flight in flights_of(leap)] == [3]
+    one_second = [posed(str(at), float(at // 2)) for at in range(6)]
+    assert [[one.name for one in flight] for flight in flights_of(one_second)] == [["0", "2", "4"]]
+    assert flights_of([replace(one, time_s=None) for one in gap]) == []
+
+
+def test_pictures_without_a_pose_are_left_out_and_counted(region, middle, laid):
+    rows = [
+        row(region, "good.png", middle),
+        row(region, "tilted.png", middle, angles=(0.0, -25.0, 0.0)),
+        row(region, "low.png", middle, height=-3),
+        row(region, "off.png", offset(middle, 900, 0)),
+        row(region, "bare.png", middle, angles=("", "", "")),
+        row(region, "broken.png", middle),
+        row(region, "tiny.png", middle, height=5),
+    ]
+    request = laid(rows)
+    noise = (request.pictures / "broken.png").read_bytes()
+    (request.pictures / "broken.png").write_bytes(noise[: len(noise) // 2])
+    Image.new("RGB", (8, 8)).save(request.pictures / "stray.png")
+    (request.pictures / "none.jpg").write_text("no picture")
+    (task,), lines = quiet(request)
+    assert task.manifest.queries == 1
+    told = "\n".join(lines)
+    assert "left out: 2 pictures (none.jpg, stray.png) that the table does not name" in told
+    assert "left out: 1 picture (tilted.png) that look more than 60 degrees away from straight down" in told
+    assert "left out: 1 picture (low.png) that were not above the ground" in told
+    assert "left out: 1 picture (off.png) whose view is not wholly on the map town-riverside" in told
+    assert "left out: 1 picture (bare.png) without angles of the camera" in told
+    assert "left out: 1 picture (tiny.png) that show less ground than 16 m a side" in told
+    assert "left out: 1 picture (broken.png) that cannot be decoded" in told
+
+
+def test_several_cameras_are_said(region, middle, laid):
+    rows = [row(region, "a.png", middle), row(region, "b.png", offset(middle, 5, 5), size=(240, 180))]
+    request = laid(rows)
+    Image.new("RGB", (240, 180), (9, 99, 9)).save(request.pictures / "b.png")
+    _, lines = quiet(request)
+    assert "2 cameras: camera 480 x 360 (1), camera 240 x 180 (1)" in lines
+
+
+def test_a_georeferenced_picture_needs_no_table(towns, region, middle, tmp_path):
+    path = tmp_path / "photos" / "a.tif"
+    path.parent.mkdir()
+    rgb = np.random.default_rng(1).integers(0, 256, (3, 200, 200), dtype=np.uint8)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=200, height=200, count=3, dtype="uint8", photometric="RGB",
+        crs=f"EPSG:{region.grid.epsg}", transform=from_origin(middle[0] - 50, middle[1] + 50, 0.5, 0.5),
+    ) as out:  # fmt: skip
+        out.write(rgb)
+    request = ImportRequest(pictures=path.parent, region=towns / "regions" / TOWN, out=tmp_path / "out", sigma_m=0.5)
+    (task,), _ = quiet(request)
+    (truth,) = task.truths
+    assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.01)
+    assert abs((truth.pose.yaw_deg + 180) % 360 - 180) < 0.01
+    assert truth.measured["truth_sigma_m"] == 0.5
+
+
+def exif_of(region, place):
+    """GPS of EXIF at a place of the map."""
+    lon, lat = lonlat(region, *place)
+    parts = {}
+    for name, value, sides in (("Latitude", lat, "NS"), ("Longitude", lon, "EW")):
+        minutes = abs(value) * 60
+        whole = (int(minutes // 60), int(minutes % 60), (minutes % 1) * 60)
+        parts[getattr(ExifTags.GPS, f"GPS{name}")] = tuple(IFDRational(round(one * 1e6), 1_000_000) for one in whole)
+        parts[getattr(ExifTags.GPS, f"GPS{name}Ref")] = sides[value < 0]
+    return parts
+
+
+def test_photos_of_a_drone_need_no_table(towns, region, middle, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    told = {"RelativeAltitude": "+80.0", "GimbalYawDegree": "30", "GimbalPitchDegree": "-90", "GimbalRollDegree": "0"}
+    rtk = told | {"RtkStdLon": "0.011", "RtkStdLat": "0.013"}
+    gps = exif_of(region, middle)
+    write_photo(folder / "gps.jpg", gps=gps, xmp=xmp_of(told), focal=24)
+    write_photo(folder / "rtk.jpg", gps=gps, xmp=xmp_of(rtk), focal=24)
+    write_photo(folder / "loose.jpg", gps={}, xmp=xmp_of(told), focal=24)
+    write_photo(folder / "flat.jpg", gps=gps, xmp=xmp_of(told), focal=None)
+    request = ImportRequest(pictures=folder, region=towns / "regions" / TOWN, out=tmp_path / "out")
+    (task,), lines = quiet(request)
+    sigmas = sorted(truth.measured["truth_sigma_m"] for truth in task.truths)
+    assert sigmas == pytest.approx([math.hypot(0.013, 1.4), math.hypot(GPS_SIGMA_M, 1.4)], abs=0.01)
+    for query, truth in asked(task):
+        assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.05)
+        assert truth.pose.yaw_deg == pytest.approx(30.0 + north_of_grid(region, *middle), abs=0.01)
+        assert str(query.observed_on) == "2024-05-01"
+    assert "left out: 1 picture (loose.jpg) without a position" in lines
+    assert any("(flat.jpg) whose camera is not known (it has no focal length" in line for line in lines)
+
+
+def test_a_table_outdoes_the_file_but_not_a_picture_that_exif_turns(region, middle, laid):
+    """Where the clocks of both disagree, that is said."""
+    place = offset(middle, 50, 20)
+    times = {"a.jpg": "2024:05:01 10:20:30", "b.jpg": "2024:05:01 11:20:30", "turned.jpg": ""}
+    rows = [row(region, name, place, size=(400, 300), time=time) for name, time in times.items()]
+    request = laid(rows, without=set(times))
+    for name in times:
+        orientation = 6 if name == "turned.jpg" else None
+        write_photo(request.pictures / name, gps=exif_of(region, middle), orientation=orientation)
+    (task,), lines = quiet(request)
+    assert [(round(truth.pose.easting_m), round(truth.pose.northing_m)) for truth in task.truths] == [
+        (round(place[0]), round(place[1]))
+    ] * 2
+    assert any("(turned.jpg) that EXIF turns" in line for line in lines)
+    assert any(line.startswith("clocks disagree: the table is +3600 s (median) off EXIF at 1 of 2") for line in lines)
+
+
+def test_altitudes_above_the_ellipsoid_are_no_heights_above_the_sea(region, middle, laid, tmp_path):
+    dem, _ = slope(region, middle, tmp_path / "dem.tif", degrees=0.0)
+    request = laid([absolute(row(region, "a.png", middle), 280.0)], heights=Heights(dem=dem))
+    request.poses.write_text(request.poses.read_text().replace("RelativeAltitude", "ellipsoidal_height"))
+    with pytest.raises(ConfigError, match="counts from the ellipsoid, where the ground's heights do from the sea"):
+        quiet(request)
+    with pytest.raises(ConfigError, match="does not cover"):
+        quiet(laid([row(region, "a.png", middle)], heights=Heights(dem=slope_far(region, middle, tmp_path))))
+
+
+def slope_far(region, middle, folder):
+    """Heights of another place."""
+    return slope(region, offset(middle, 50_000, 0), folder / "far.tif", degrees=1.0)[0]
+
+
+# What is asked, error, its words.
+REFUSED = [
+    ({"name": "clean"}, ConfigError, "is no name for a suite of your own"),
+    ({"name": "My Photos"}, ConfigError, "is no name for a suite of your own"),
+    ({"sigma_m": 0.0}, ConfigError, "--sigma lies above 0"),
+    ({"seed": -1}, ConfigError, "--seed is 0 or more"),
+    ({"region": Path("none")}, StoreError, "none"),
+    ({"pictures": Path("none")}, ImageError, "there is no picture or folder none"),
+    ({"poses": Path("none.csv")}, SasgeoError, "name a table of poses"),
+]
+
+
+@pytest.mark.parametrize(("changes", "error", "words"), REFUSED)
+def test_what_cannot_be_imported_is_refused_in_one_line(changes, error, words, region, middle, laid):
+    request = laid([row(region, "a.png", middle)])
+    with pytest.raises(error) as caught:
+        import_photos(replace(request, **changes))
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_heights_have_one_source():
+    with pytest.raises(ConfigError, match="heights come from one source"):
+        Heights(height_m=80.0, takeoff_m=400.0)
+    with pytest.raises(ConfigError, match="--height lies above 0"):
+        Heights(height_m=-1.0)
+
+
+def test_nothing_is_written_where_no_picture_is_left(region, middle, laid, tmp_path):
+    with pytest.raises(ConfigError, match=r"1 picture \(a\.png\) whose view is not wholly on the map"):
+        quiet(laid([row(region, "a.png", offset(middle, 5000, 0))]))
+    request = laid([row(region, "a.png", middle)])
+    (request.pictures / "a.png").write_bytes((request.pictures / "a.png").read_bytes()[:3000])
+    with pytest.raises(ConfigError, match="cannot be decoded"):
+        quiet(request)
+    assert not list((tmp_path / "out").rglob("*.parquet"))
+
+
+def test_the_command_prints_the_folders_of_its_tasks(region, middle, laid, program):
+    request = laid([row(region, "a.png", middle)])
+    words = ("--region", str(request.region), "--poses", str(request.poses), "--out", str(request.out))
+    code, out, err = program("import-photos", str(request.pictures), *words)
+    assert code == 0, err
+    assert out.strip() == str(request.out / "tasks" / "photos" / TOWN)
+    assert "1 query in" in err
+    manifest = Task.open(request.out / "tasks" / "photos" / TOWN).manifest
+    assert (manifest.suite, manifest.queries, manifest.frames) == ("photos", 1, 1)
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_segmenter_that_need_not_learn_sees_pictures_of_a_task_without_a_split(region, middle, laid):
+    tasks, _ = quiet(laid([row(region, "a.png", middle)]))
+    wanted = SegmentTasks(
+        spec="colour_thresholds", tasks=[tasks[0].folder], split=None, out=tasks[0].root, is_sandboxed=False
+    )
+    (folder,) = segment_tasks(wanted)
+    (query,) = Task.open(folder).queries()
+    assert query.suite == "photos+colour_thresholds"
+    assert query.evidence.unknown_share < 1.0
+    with pytest.raises(ConfigError, match="unet needs training, and these tasks have no split: name one with --split"):
+        segment_tasks(replace(wanted, spec="unet"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that make tasks of a user's own pictures: import-photos."""
+"""Commands that make tasks of a user's own pictures and masks: import-photos, import-masks."""
 
 import re
 from dataclasses import dataclass, field
@@ -11,8 +11,12 @@ import typer
 from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.observing.import_masks import SUITE as MASKS
+from sasgeo_bench.observing.import_masks import MaskRequest
+from sasgeo_bench.observing.import_masks import import_masks as masks_imported
 from sasgeo_bench.observing.import_photos import GROUP, SUITE, ImportRequest
 from sasgeo_bench.observing.import_photos import import_photos as imported_by
+from sasgeo_bench.observing.masks import read_legend
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights
 from sasgeo_bench.tasks.query import PriorGroup
@@ -23,14 +27,10 @@ _ORIGIN: Final = re.compile(rf"\s*({_NUMBER})\s*,\s*({_NUMBER})\s*(?:,\s*({_NUMB
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportPhotosOptions(Options):
-    """Flags of import-photos."""
+class PosedOptions(Options):
+    """Flags of both commands: where pictures lie, how high they were taken, and what is known before."""
 
-    pictures: Annotated[Path, typer.Argument(help="folder of photos (JPEG, TIFF, DNG, PNG, WebP, GeoTIFF)")] = field(
-        kw_only=False
-    )
     region: Annotated[str, typer.Option(help="built region, or its folder")]
-    name: Annotated[str, typer.Option(help="suite of the task")] = SUITE
     poses: Annotated[Path | None, typer.Option(help="table of poses; default: EXIF and XMP of the photos")] = None
     epsg: Annotated[int | None, typer.Option(help="of a table's eastings and northings")] = None
     origin: Annotated[str | None, typer.Option(help="LON,LAT[,HEIGHT] of a table's metres east, north, up")] = None
@@ -47,6 +47,30 @@ class ImportPhotosOptions(Options):
     prior: Annotated[str, typer.Option(help="prior group, as in r500-weak-s10")] = GROUP.name
     seed: Annotated[int, typer.Option(help="of priors and odometry")] = 0
     out: Out = Path("out")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportPhotosOptions(PosedOptions):
+    """Flags of import-photos."""
+
+    pictures: Annotated[Path, typer.Argument(help="folder of photos (JPEG, TIFF, DNG, PNG, WebP, GeoTIFF)")] = field(
+        kw_only=False
+    )
+    name: Annotated[str, typer.Option(help="suite of the task")] = SUITE
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportMasksOptions(PosedOptions):
+    """Flags of import-masks."""
+
+    masks: Annotated[Path, typer.Argument(help="folder of masks (PNG, GeoTIFF, npy, npz), or a COCO file (json)")] = (
+        field(kw_only=False)
+    )
+    legend: Annotated[Path, typer.Option(help="what values, colours, bands or categories mean (*.toml)")]
+    photos: Annotated[
+        Path | None, typer.Option(help="folder of the photos, of the same names; default: masks are georeferenced")
+    ] = None
+    name: Annotated[str, typer.Option(help="suite of the task")] = MASKS
 
 
 @takes(ImportPhotosOptions)
@@ -81,24 +105,74 @@ def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
         ...
     sasgeo_bench.core.errors.ConfigError: heights come from one source: give --height, --dem or --takeoff-height alone
     """
-    heights = Heights(height_m=options.height, dem=options.dem, takeoff_m=options.takeoff_height)
+    tasks = imported_by(_request(options, options.pictures))
+    for task in tasks:
+        options.say(task.folder)
+    return tasks
+
+
+def _request(options: "ImportPhotosOptions | ImportMasksOptions", pictures: Path) -> ImportRequest:
     folder = Path(options.region)
-    request = ImportRequest(
-        pictures=options.pictures,
+    return ImportRequest(
+        pictures=pictures,
         region=folder if (folder / "region.json").is_file() else options.out / "regions" / options.region,
         out=options.out,
         name=options.name,
         poses=options.poses,
         facts=PoseFacts(epsg=options.epsg, origin=_origin(options.origin), pitch_zero=options.pitch_zero),
-        heights=heights,
+        heights=Heights(height_m=options.height, dem=options.dem, takeoff_m=options.takeoff_height),
         sigma_m=options.sigma,
         group=PriorGroup.parse(options.prior),
         seed=options.seed,
     )
-    tasks = imported_by(request)
+
+
+@takes(ImportMasksOptions)
+def import_masks(options: ImportMasksOptions) -> tuple[Task, ...]:
+    """Make tasks of masks or probabilities that your own network made of pictures whose places are known.
+
+    Their evidence is there at once: `run` and `score` work as on any task. What the legend does not name is unknown,
+    and said. Poses are as in `import_photos`: of the photos that the masks are of, of a table, or the masks' own.
+
+    Returns
+    -------
+    tuple of Task
+        The task of single views, and that of flights where pictures follow each other.
+
+    Raises
+    ------
+    ConfigError
+        If an option or the legend makes no sense, or no mask can be asked.
+    ImageError
+        If there is no mask.
+    PoseError
+        If the table cannot be read.
+    StoreError
+        If the region is missing or damaged.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> sgb.import_masks("masks", legend="nowhere.toml", region="vaduz")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.core.errors.ConfigError: nowhere.toml cannot be read: name a legend (*.toml)
+    """
+    legend = read_legend(options.legend)
+    photos = _request(options, options.photos or options.masks)
+    tasks = masks_imported(MaskRequest(photos=photos, masks=options.masks, legend=legend))
     for task in tasks:
         options.say(task.folder)
     return tasks
+
+
+def import_masks_command(options: ImportMasksOptions) -> None:
+    """Make tasks of masks or probabilities that your own network made of pictures whose places are known."""
+    lines: list[object] = []  # printed once the progress bars are gone
+    with shown_progress():
+        import_masks(**vars(options) | {"say": lines.append})
+    for line in lines:
+        say(line)
 
 
 def import_photos_command(options: ImportPhotosOptions) -> None:

@@ -132,7 +132,9 @@ def takes(options: Callable[Words, Object]) -> Callable[[Callable[[Object], Resu
         words = inspect.signature(options).parameters
         plain = [words[name].replace(annotation=get_args(kind)[0]) for name, kind in kinds.items()]
         others = [item for name, item in words.items() if name not in kinds]
-        signature = inspect.signature(function).replace(parameters=[*plain, *others])
+        # What is positional stands first, also where an object adds it to the flags of its base.
+        parameters = sorted([*plain, *others], key=lambda item: item.kind)
+        signature = inspect.signature(function).replace(parameters=parameters)
         called.__signature__ = signature  # type: ignore[attr-defined]
         lines = [f"{item.name} : {_shown(item.annotation)}\n    {get_args(kinds[item.name])[1].help}" for item in plain]
         summary, rule, rest = inspect.cleandoc(function.__doc__ or "").partition("\n\nReturns\n")

@@ -43,6 +43,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Your own pictures": {
         "locate": "observing",
         "import-photos": "importing_photos",
+        "import-masks": "importing_photos",
     },
     "Queries": {
         "new-split": "splits",

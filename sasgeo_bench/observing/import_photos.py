@@ -21,7 +21,7 @@ from sasgeo_bench.flights.drift_profile import load_profile
 from sasgeo_bench.flights.odometry import Odometry, draw_odometry
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Prior
-from sasgeo_bench.observing.picture_poses import PoseFacts
+from sasgeo_bench.observing.picture_poses import PoseFacts, PoseTable
 from sasgeo_bench.observing.pictures import list_pictures, names_of, see
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.observing.posed_pictures import Heights, PosedPicture, PosedPictures, lenses_of, pose_pictures
@@ -120,6 +120,15 @@ class ImportRequest:
             raise ConfigError(f"--seed is 0 or more, got {self.seed!r}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Perceived:
+    """What a query holds of a picture: evidence, and the picture itself with labels, unless others looked at it."""
+
+    evidence: Evidence
+    frames: tuple[Frame, ...] = ()
+    labels: tuple[FrameLabels, ...] = ()
+
+
 def import_photos(request: ImportRequest) -> tuple[Task, ...]:
     """Write the tasks of some pictures: single views, and flights where pictures follow each other.
 
@@ -139,8 +148,18 @@ def import_photos(request: ImportRequest) -> tuple[Task, ...]:
     StoreError
         If the region is missing, or a folder cannot be written; nothing is half-written.
     """
-    manifest, state = read_manifest(request.region), State.read(request.region)
-    found = _posed(request, manifest.epsg)
+    manifest = read_manifest(request.region)
+    return write_tasks(request, manifest, _posed(request, manifest.epsg))
+
+
+def write_tasks(
+    request: ImportRequest,
+    manifest: Manifest,
+    found: PosedPictures,
+    perceive: Callable[[PosedPicture], Perceived] | None = None,
+) -> tuple[Task, ...]:
+    """Write the tasks of pictures with poses, as `import_photos` does; `perceive` as in `TaskWriter`."""
+    state = State.read(request.region)
     for one in list(found.pictures):
         place_m = np.array([one.pose.easting_m, one.pose.northing_m])
         if not state.is_mapped(place_m, one.side_m / math.sqrt(2)):  # in any heading
@@ -150,7 +169,7 @@ def import_photos(request: ImportRequest) -> tuple[Task, ...]:
     if not found.pictures:
         reasons = "; ".join(f"{named(names, 'picture')} {why}" for why, names in found.left_out.items())
         raise ConfigError(f"no picture of {request.pictures} can be asked: {reasons}")
-    writer = _Writer(request=request, manifest=manifest, state=state)
+    writer = TaskWriter(request=request, manifest=manifest, state=state, perceive=perceive)
     tasks = [writer.put(request.name, partial(writer.views, found.pictures), found.pictures)]
     flights = flights_of([one for one in found.pictures if one.name not in writer.failed])
     if flights:
@@ -166,6 +185,12 @@ def import_photos(request: ImportRequest) -> tuple[Task, ...]:
 
 
 def _posed(request: ImportRequest, epsg: int) -> PosedPictures:
+    table = table_of(request)
+    return pose_pictures(request.pictures, table, epsg=epsg, heights=request.heights, sigma_m=request.sigma_m)
+
+
+def table_of(request: ImportRequest) -> PoseTable | None:
+    """Read the table of poses of a request, and tell what it holds; None without one."""
     table = None
     if request.poses is not None:
         facts = request.facts
@@ -174,7 +199,7 @@ def _posed(request: ImportRequest, epsg: int) -> PosedPictures:
         table = read_pose_table(request.poses, facts)
         for line in table.lines():
             tell(line)
-    return pose_pictures(request.pictures, table, epsg=epsg, heights=request.heights, sigma_m=request.sigma_m)
+    return table
 
 
 def _tell(found: PosedPictures) -> None:
@@ -213,12 +238,16 @@ Pairs = Iterator[tuple[Query, Truth]]
 
 
 @dataclass(kw_only=True)
-class _Writer:
-    """Writes tasks; pictures that cannot be decoded are left out and counted."""
+class TaskWriter:
+    """Writes tasks of pictures with poses; pictures that cannot be decoded are left out and counted.
+
+    `perceive` makes of a picture what its query holds; by default the picture, of which nothing is seen yet.
+    """
 
     request: ImportRequest
     manifest: Manifest
     state: State
+    perceive: Callable[[PosedPicture], Perceived] | None = None
     failed_by: "dict[str, list[str]]" = field(default_factory=dict)
     labels: "dict[tuple[int, ...], FrameLabels]" = field(default_factory=dict)
 
@@ -314,22 +343,12 @@ class _Writer:
     ) -> tuple[Query, Truth] | None:
         """Return the query and truth of a picture; None, and the reason kept, if it cannot be decoded."""
         try:
-            sight = see(one.picture)
-            image = _small(sight.image)
-            east_m, north_m = sight.middle_m
-            height_m = 0.0 if one.picture.camera is None else one.position_m[2]
-            frame = Frame(
-                picture=encode_webp(image.rgb),
-                camera=image.camera.moved(east_m=-east_m, north_m=-north_m),
-                height_sigma_m=round(height_m * one.picture.scale_sigma, 2),
-                attitude_sigma_deg=1.0 if one.picture.camera is not None else 0.0,
-            )
+            seen = self._pictured(one) if self.perceive is None else self.perceive(one)
         except SasgeoError as error:
             self.failed_by.setdefault(f"that cannot be decoded ({plain(str(error))[:120]})", []).append(one.name)
             return None
-        state, group = self.state, self.request.group
-        size_cells = sight.size_cells // _CELLS * _CELLS
-        evidence = unseen(state.classes, size_cells, sight.cell_size_m)
+        state, group, evidence = self.state, self.request.group, seen.evidence
+        height_m = 0.0 if one.picture.camera is None else one.position_m[2]
         taken = one.picture.taken_at
         query = Query(
             query_id=query_id,
@@ -343,7 +362,7 @@ class _Writer:
             observed_on=state.date if taken is None else taken.date(),
             season="",
             prior=prior,
-            frames=(frame,),
+            frames=seen.frames,
             step=step,
         )
         density = self._density(one, evidence)
@@ -372,9 +391,25 @@ class _Writer:
                 **({UNANSWERABLE: 1.0} if density < LEAST_DRAWN else {}),
             },
             detector=REAL,
-            labels=(self._labels(image),),
+            labels=seen.labels,
         )
         return query, truth
+
+    def _pictured(self, one: PosedPicture) -> Perceived:
+        """Return a picture of which nothing is seen yet."""
+        sight = see(one.picture)
+        image = _small(sight.image)
+        east_m, north_m = sight.middle_m
+        height_m = 0.0 if one.picture.camera is None else one.position_m[2]
+        frame = Frame(
+            picture=encode_webp(image.rgb),
+            camera=image.camera.moved(east_m=-east_m, north_m=-north_m),
+            height_sigma_m=round(height_m * one.picture.scale_sigma, 2),
+            attitude_sigma_deg=1.0 if one.picture.camera is not None else 0.0,
+        )
+        size_cells = view_cells(sight.size_cells)
+        evidence = unseen(self.state.classes, size_cells, sight.cell_size_m)
+        return Perceived(evidence=evidence, frames=(frame,), labels=(self._labels(image),))
 
     def _density(self, one: PosedPicture, evidence: Evidence) -> float:
         """Return the share of a view's cells in which the map shows a road, building, water or other drawn feature."""
@@ -388,6 +423,11 @@ class _Writer:
         if shape not in self.labels:
             self.labels[shape] = FrameLabels.of(self.state.classes, np.full(shape, UNKNOWN, dtype=np.uint8))
         return self.labels[shape]
+
+
+def view_cells(most: int) -> int:
+    """Return the cells along a side of a view that has at most so many: a multiple of a few, 16 at least."""
+    return max(_CELLS, most // _CELLS * _CELLS)
 
 
 def _trajectory(pictures: Sequence[PosedPicture]) -> Trajectory:

@@ -20,7 +20,7 @@ from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from sasgeo_bench.core.config import Document, parse_toml
-from sasgeo_bench.core.errors import ImageError, named
+from sasgeo_bench.core.errors import ConfigError, ImageError, named
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.json import parse_json
 from sasgeo_bench.core.paths import plain_file, read_bounded
@@ -121,7 +121,7 @@ def read_legend(path: Path) -> Legend:
     try:
         text = plain_file(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ImageError(f"{path} cannot be read: name a legend (*.toml)") from error
+        raise ConfigError(f"{path} cannot be read: name a legend (*.toml)") from error
     return parse_toml(text, Legend, source=str(path))
 
 

@@ -88,6 +88,8 @@ class OwnPicture:
         Above the origin, the picture's up being north; of a photo.
     gsd_m : float, optional
         Width of a pixel on the ground, of a georeferenced picture.
+    size_m : tuple of float, optional
+        Width and height of the ground in a georeferenced picture, metres.
     height_m : float, optional
         Of a photo, above the ground as it is believed.
     note : str
@@ -103,6 +105,7 @@ class OwnPicture:
     taken_at: dt.datetime | None = None
     camera: Camera | None = None
     gsd_m: float | None = None
+    size_m: tuple[float, float] | None = None
     height_m: float | None = None
     note: str = ""
 
@@ -283,6 +286,7 @@ def _georeferenced(path: Path) -> OwnPicture | None:
         heading_by="georeference",
         scale_sigma=0.03,
         gsd_m=ground.gsd_m,
+        size_m=ground.size_m,
     )
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import rasterio
 from PIL import ExifTags, Image
 from rasterio.errors import RasterioError
 
 from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError, counted
+from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, rotation
@@ -133,7 +133,7 @@ def pose_pictures(
     for path, name in zip(paths, names_of(paths, folder), strict=True):
         try:
             if path.suffix.lower() in (".tif", ".tiff"):
-                picture = open_picture(path) if _is_georeferenced(path) else None
+                picture = open_picture(path) if is_georeferenced(path) else None
                 if picture is not None and picture.position_by == "georeference":
                     found.pictures.append(_from_above(picture, name, epsg, sigma_m))
                     continue
@@ -166,9 +166,10 @@ def _reason(error: SasgeoError, name: str) -> str:
     return plain(str(error)).replace(name, "it").replace(name.rpartition("/")[2], "it")[:160]
 
 
-def _is_georeferenced(path: Path) -> bool:
+def is_georeferenced(path: Path) -> bool:
+    """Return whether a file is a TIFF that says where it lies."""
     try:
-        with rasterio.open(path) as source:
+        with open_geotiff(path) as source:
             return source.crs is not None and not source.transform.is_identity
     except RasterioError:
         return False

@@ -255,7 +255,7 @@ def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: f
     if photo.lon_deg is None or photo.lat_deg is None:
         return "without a position"
     if photo.gimbal is None:
-        return "without angles of the camera"
+        return "without angles of the camera (a column gimbal_pitch of -90 says straight down)"
     place_m = grid_place(photo.lon_deg, photo.lat_deg, epsg)[:2] if row is None else row.in_crs(epsg)
     stated = of_file_m if row is None else row.sigma_m
     stated = sigma_m if stated is None else stated

@@ -434,6 +434,22 @@ def test_a_lens_of_a_table_fits_a_smaller_copy_of_its_picture(region, middle, la
     assert any(line.startswith("heights count from the origin") for line in lines)
 
 
+def test_a_tum_file_names_the_pictures_of_its_folder_by_their_order(region, middle, laid):
+    request = laid([row(region, name, middle, time=clock(0)) for name in ("b.png", "a.png", "c.png")])
+    lon, lat = lonlat(region, *middle)
+    tum = request.poses.with_name("run.txt")
+    tum.write_text("".join(f"{at} {10 * at} 0 80 1 0 0 0\n" for at in (5, 6, 7)))
+    # Pictures of noise have no lens of their own: one with EXIF has.
+    for name in ("a", "b", "c"):
+        (request.pictures / f"{name}.png").unlink()
+        write_photo(request.pictures / f"{name}.jpg", focal=24)
+    tasks, _ = quiet(replace(request, poses=tum, facts=PoseFacts(origin=(lon, lat, 0.0))))
+    east = sorted(round(truth.pose.easting_m - middle[0], 1) for truth in tasks[0].truths)
+    assert east == pytest.approx([50.0, 60.0, 70.0], abs=3.0)  # its east is the true one
+    steps = [query.step.frame for query in tasks[1].queries()]
+    assert steps == [0, 1, 2]
+
+
 def test_swapped_places_are_guessed_where_they_lie_on_the_map(region, middle, laid):
     cells = row(region, "a.png", middle).split(",")
     cells[1:3] = cells[2:0:-1]

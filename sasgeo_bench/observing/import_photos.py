@@ -160,15 +160,18 @@ def write_tasks(
 ) -> tuple[Task, ...]:
     """Write the tasks of pictures with poses, as `import_photos` does; `perceive` as in `TaskWriter`."""
     state = State.read(request.region)
+    away: list[PosedPicture] = []
     for one in list(found.pictures):
         place_m = np.array([one.pose.easting_m, one.pose.northing_m])
         if not state.is_mapped(place_m, one.side_m / math.sqrt(2)):  # in any heading
             found.pictures.remove(one)
             found.left_out[f"whose view is not wholly on the map {state.region}"].append(one.name)
+            away.append(one)
     _tell(found)
     if not found.pictures:
         reasons = "; ".join(f"{named(names, 'picture')} {why}" for why, names in found.left_out.items())
-        raise ConfigError(f"no picture of {request.pictures} can be asked: {reasons}")
+        hint = "; longitude and latitude seem to be swapped" if any(_is_swapped(one, manifest) for one in away) else ""
+        raise ConfigError(f"no picture of {request.pictures} can be asked: {reasons}{hint}")
     writer = TaskWriter(request=request, manifest=manifest, state=state, perceive=perceive)
     tasks = [writer.put(request.name, partial(writer.views, found.pictures), found.pictures)]
     flights = flights_of([one for one in found.pictures if one.name not in writer.failed])
@@ -200,6 +203,13 @@ def table_of(request: ImportRequest) -> PoseTable | None:
         for line in table.lines():
             tell(line)
     return table
+
+
+def _is_swapped(one: PosedPicture, manifest: Manifest) -> bool:
+    """Return whether a picture off the map lies on it with its longitude and latitude swapped."""
+    west, south, east, north = manifest.bounds_lonlat
+    lat_deg, lon_deg = one.picture.lonlat or (math.nan, math.nan)
+    return west <= lon_deg <= east and south <= lat_deg <= north
 
 
 def _tell(found: PosedPictures) -> None:

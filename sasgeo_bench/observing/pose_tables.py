@@ -76,7 +76,10 @@ def read_pose_table(path: str | Path, facts: PoseFacts | None = None) -> PoseTab
     if not poses:
         reasons = "; ".join(f"{named([plain(name) for name in names], 'row')} {why}" for why, names in left_out.items())
         raise PoseError(f"no row of {path.name} ({found.kind}) is a pose: {reasons or 'it has no rows'}")
-    return PoseTable(path=path, kind=found.kind, poses=poses, left_out=left_out, notes=found.notes)
+    notes = found.notes
+    if any(pose.height_m is not None and pose.height_of == "origin" for pose in poses):
+        notes += ("heights count from the origin, as if it were on the ground: give its own height with --dem",)
+    return PoseTable(path=path, kind=found.kind, poses=poses, left_out=left_out, notes=notes)
 
 
 def _read(path: Path, facts: PoseFacts) -> Read:

@@ -29,13 +29,14 @@ from sasgeo_bench.observing.pictures import (
     open_picture,
     see,
 )
-from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
 from sasgeo_bench.sensing.photos import DJI, Photo, number_of, read_head, read_photo
 
 GPS_SIGMA_M: Final = 3.3  # of one axis: 95 % within 8 m, as the GPS performance standard of 2020 states it
 _TILT_SIGMA: Final = 0.0175  # metres to a metre of height: a gimbal is right to a degree
 _MOST_BYTES: Final = 64 * 2**20
+_SAME_SHAPE: Final = 0.01  # by which the aspects of a picture and of a smaller copy differ, from rounding
 _CELL_M: Final = 10.0  # of the lattice of heights; GLO-30 and SRTM have 30 m
 _AROUND_M: Final = 400.0  # of ground around the cameras whose heights are read
 
@@ -219,10 +220,27 @@ class _Stand:
         return self.photo.height_m if self.row is None or self.row.height_m is None else self.row.height_m
 
     def camera(self, height_m: float) -> Camera:
-        lens = None if self.row is None else self.row.intrinsics
+        lens = None if self.row is None or self.row.intrinsics is None else _fitted(self.row.intrinsics, self.photo)
         camera = self.photo.camera(epsg=self.epsg, height_m=height_m, intrinsics=lens)
         # A place in another datum came straight to the map's CRS.
         return camera.moved(east_m=self.place_m[0] - camera.east_m, north_m=self.place_m[1] - camera.north_m)
+
+
+def _fitted(lens: Intrinsics, photo: Photo) -> Intrinsics | None:
+    """Return the lens of a table for the picture at hand, which may be a smaller copy; None if it is another picture.
+
+    Tools that scale pictures round their sides, each by itself.
+    """
+    across, down = photo.width_px / lens.width_px, photo.height_px / lens.height_px
+    if abs(across / down - 1) > _SAME_SHAPE:
+        return None
+    return replace(
+        lens,
+        width_px=photo.width_px,
+        height_px=photo.height_px,
+        focal_px=(lens.focal_px[0] * across, lens.focal_px[1] * down),
+        centre_px=(lens.centre_px[0] * across, lens.centre_px[1] * down),
+    )
 
 
 def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: float | None) -> _Stand | str:
@@ -238,7 +256,7 @@ def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: f
     if photo.lon_deg is None or photo.lat_deg is None:
         return "without a position"
     if photo.gimbal is None:
-        return "without angles of the camera"
+        return "without angles of the camera (a column gimbal_pitch of -90 says straight down)"
     place_m = grid_place(photo.lon_deg, photo.lat_deg, epsg)[:2] if row is None else row.in_crs(epsg)
     stated = of_file_m if row is None else row.sigma_m
     stated = sigma_m if stated is None else stated

@@ -263,6 +263,7 @@ WITHIN: Final = _mean(  # shows the effect of wrong headings on the primary metr
     source="the SASGeo paper, Eq. (12)",
     tracks=_SINGLE,
     values=lambda scores: scores["is_right"].to_numpy(float),
+    counts=partial(_is_sharp, within_m=SUCCESS_M[0]),
 )
 CEILING: Final = _mean(  # the same for every matcher
     name="ceiling",

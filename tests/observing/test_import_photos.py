@@ -18,6 +18,7 @@ import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, StoreError
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.observing.import_photos import ImportRequest, flights_of, import_photos
+from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.pictures import OwnPicture
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights, PosedPicture
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
@@ -410,6 +411,50 @@ def test_a_table_outdoes_the_file_but_not_a_picture_that_exif_turns(region, midd
     ] * 2
     assert any("(turned.jpg) that EXIF turns" in line for line in lines)
     assert any(line.startswith("clocks disagree: the table is +3600 s (median) off EXIF at 1 of 2") for line in lines)
+
+
+def test_a_lens_of_a_table_fits_a_smaller_copy_of_its_picture(region, middle, laid):
+    """COLMAP's sizes of scaled pictures are rounded, side by side; of another shape it is another picture's."""
+    rows = [row(region, name, middle) for name in ("a.png", "b.png")]
+    request = laid(rows)
+    lens = f"PINHOLE 961 720 {2 * FOCAL * 961 / 960} {2 * FOCAL} 480.5 360"
+    folder = request.poses.parent / "model"
+    folder.mkdir()
+    (folder / "cameras.txt").write_text(f"1 {lens}\n2 PINHOLE 900 900 800 800 450 450\n")
+    lon, lat = lonlat(region, *middle)
+    down = "0 1 0 0 0 0 80"  # half a turn about its right: it looks down, and its up is north
+    (folder / "images.txt").write_text(f"1 {down} 1 a.png\n\n2 {down} 2 b.png\n\n")
+    origin = PoseFacts(origin=(lon, lat, 0.0))
+    tasks, lines = quiet(replace(request, poses=folder, facts=origin))
+    ((query, truth),) = asked(tasks[0])
+    assert truth.measured["height_m"] == pytest.approx(80.0, abs=0.01)
+    assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.01)
+    assert query.frames[0].camera.intrinsics.focal_px == pytest.approx((FOCAL, FOCAL), rel=1e-6)
+    assert any("(b.png) whose camera is not known (it has no focal length" in line for line in lines)
+    assert any(line.startswith("heights count from the origin") for line in lines)
+
+
+def test_a_tum_file_names_the_pictures_of_its_folder_by_their_order(region, middle, laid):
+    request = laid([row(region, name, middle, time=clock(0)) for name in ("b.png", "a.png", "c.png")])
+    lon, lat = lonlat(region, *middle)
+    tum = request.poses.with_name("run.txt")
+    tum.write_text("".join(f"{at} {10 * at} 0 80 1 0 0 0\n" for at in (5, 6, 7)))
+    # Pictures of noise have no lens of their own: one with EXIF has.
+    for name in ("a", "b", "c"):
+        (request.pictures / f"{name}.png").unlink()
+        write_photo(request.pictures / f"{name}.jpg", focal=24)
+    tasks, _ = quiet(replace(request, poses=tum, facts=PoseFacts(origin=(lon, lat, 0.0))))
+    east = sorted(round(truth.pose.easting_m - middle[0], 1) for truth in tasks[0].truths)
+    assert east == pytest.approx([50.0, 60.0, 70.0], abs=3.0)  # its east is the true one
+    steps = [query.step.frame for query in tasks[1].queries()]
+    assert steps == [0, 1, 2]
+
+
+def test_swapped_places_are_guessed_where_they_lie_on_the_map(region, middle, laid):
+    cells = row(region, "a.png", middle).split(",")
+    cells[1:3] = cells[2:0:-1]
+    with pytest.raises(ConfigError, match="longitude and latitude seem to be swapped"):
+        quiet(laid([",".join(cells)]))
 
 
 def test_altitudes_above_the_ellipsoid_are_no_heights_above_the_sea(region, middle, laid, tmp_path):

@@ -47,7 +47,7 @@ def test_success_is_not_scored_within_less_than_two_deviations_of_the_truth():
     table = table.assign(strength=[2.0, 20.0, 5.1])
     counts = {metric.name: metric.counts(table).tolist() for metric in means_of("localization")}
     assert (counts["success_25m"], counts["success_10m"]) == ([True, False, True], [True, False, False])
-    assert counts["answered"] == [True, True, True]
+    assert (counts["within_25m"], counts["answered"]) == ([True, False, True], [True, True, True])
 
 
 def test_quantiles_name_their_share():

@@ -67,6 +67,7 @@ ONLY_PARSED = {
     r"^sasgeo-bench verify crossfit": "minutes: tests/cli/test_cli_queries.py does it",
     r"^sasgeo-bench locate ": "needs pictures of the reader's own; tests/observing/test_locate.py draws some",
     r"^sasgeo-bench import-photos |tasks/photos": "needs photos; tests/observing/test_import_photos.py makes some",
+    r"^sasgeo-bench import-masks |tasks/masks": "needs masks; tests/observing/test_import_masks.py makes some",
     r"^sasgeo-bench (import|locate)-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
     r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",
 }

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Folders of photos made out of real mosaics, from end to end; and a drone's own photos over no map at hand."""
+
+import argparse
+import shutil
+from pathlib import Path
+
+import pytest
+
+import sasgeo_bench as sgb
+from benchmarks.own_photos import is_right, take
+from sasgeo_bench.core.errors import SasgeoError
+from sasgeo_bench.observing.locate import LocateRequest, locate
+from sasgeo_bench.observing.pictures import list_pictures, open_picture, see
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from tests.sensing.test_photos import brighton_beach
+
+pytestmark = [pytest.mark.real, pytest.mark.slow]
+MOSAICS = ("pardubice-ortho", "chateaugiron-ortho", "andorra-la-vella-ortho")
+
+
+def built(name: str, extracts: Path, out: Path) -> sgb.Region:
+    """A region with imagery, built of the data at hand; the test is skipped where a part is not."""
+    spec = read_region_file(find_region_file(name))
+    try:
+        plan = plan_build(spec, out=out, extract_folders=(extracts,), imagery_folders=())
+        build_region(plan)
+    except SasgeoError as error:
+        pytest.skip(f"{name}: {error}")
+    return sgb.read_region(plan.folder)
+
+
+@pytest.mark.parametrize("name", MOSAICS)
+@pytest.mark.parametrize("tilt", [0.0, 20.0])
+def test_photos_of_a_mosaic_are_found_or_withheld(real_extracts: Path, tmp_path: Path, name: str, tilt: float) -> None:
+    if shutil.which("exiftool") is None:
+        pytest.skip("exiftool is not installed")
+    region = built(name, real_extracts, tmp_path)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    how = argparse.Namespace(count=4, elsewhere=0, side=220.0, tilt=tilt, ground="built", seed=3)
+    taken = {one.file: one for one in take(region, photos, how, None)}
+    assert len(taken) == 4
+    found = locate(LocateRequest(pictures=photos, out=tmp_path, into=tmp_path / "located")).fixes
+    assert [fix.status for fix in found if fix.status == "failed"] == []
+    right = [is_right(fix, taken[fix.file]) for fix in found]
+    assert sum(right) >= (1 if "andorra" in name else 3)
+    wrong = [fix.file for fix, is_found in zip(found, right, strict=True) if fix.is_accepted and not is_found]
+    assert wrong == []
+
+
+def test_a_drones_own_photos_say_where_and_how_they_were_taken() -> None:
+    folder = brighton_beach()
+    if folder is None:
+        pytest.skip("the photos of Brighton Beach are not here")
+    paths = list_pictures(folder)
+    assert len(paths) == 6
+    for path in paths:
+        picture = open_picture(path)
+        assert picture.position_by == "EXIF"
+        assert picture.lonlat is not None
+        assert picture.height_m is not None
+        sight = see(picture)
+        assert 16 < sight.side_m < 384
+        assert sight.image.camera.tilt_deg < 60

@@ -28,9 +28,8 @@ from PIL import Image
 
 import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import SasgeoError
-from sasgeo_bench.geometry.projection import to_lonlat
+from sasgeo_bench.geometry.projection import to_grid, to_lonlat
 from sasgeo_bench.observing.locate import Fix, LocateRequest, locate
-from sasgeo_bench.observing.pictures import grid_place
 from sasgeo_bench.scoring.intervals import wilson_share
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
@@ -123,7 +122,7 @@ def take(region: sgb.Region, folder: Path, given: argparse.Namespace, other: sgb
             r_west, r_south, r_east, r_north = region.imagery.record.bounds_m
             east_m, north_m = rng.uniform(r_west, r_east), rng.uniform(r_south, r_north)
         lon, lat = to_lonlat(region.grid.epsg).transform(east_m, north_m)
-        heading_deg = (yaw_deg - grid_place(lon, lat, region.grid.epsg)[2]) % 360
+        heading_deg = (yaw_deg - to_grid(lon, lat, region.grid.epsg)[2]) % 360
         name = f"{'elsewhere' if other is not None else 'photo'}_{len(found):03}.jpg"
         Image.fromarray(rgb).save(folder / name, quality=92)
         said_m = height_m * (1 + HEIGHT_OFF * rng.standard_normal())

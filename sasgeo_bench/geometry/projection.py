@@ -4,11 +4,17 @@
 Transformers of pyproj may be shared by threads since version 3.1.
 """
 
+import math
 from functools import lru_cache
 from typing import Final
 
+import numpy as np
 import pyproj
+from numpy.typing import NDArray
 
+from sasgeo_bench.geometry.pose import bearing_deg
+
+_STEP_DEG: Final = 1e-4  # to the north, by which the grid's north is found
 WGS84: Final = 4326  # EPSG code of longitude and latitude
 
 
@@ -34,3 +40,29 @@ def to_lonlat(epsg: int) -> pyproj.Transformer:
     [9.0, 0.0]
     """
     return between(epsg, WGS84)
+
+
+def true_north_deg(lon_deg: NDArray[np.float64], lat_deg: NDArray[np.float64], epsg: int) -> NDArray[np.float64]:
+    """Return the bearing of true north in the grid of a projected CRS, shape (N,), degrees of -180 to 180.
+
+    >>> true_north_deg(np.array([10.0]), np.array([47.0]), 32632).round(2).tolist()
+    [-0.73]
+    """
+    step = np.where(lat_deg < 0, _STEP_DEG, -_STEP_DEG)  # never over a pole
+    here, there = (np.stack(from_lonlat(epsg).transform(lon_deg, lat_deg + more)) for more in (0.0, step))
+    east, north = np.sign(step) * (there - here)
+    return np.asarray((bearing_deg(east, north) + 180.0) % 360.0 - 180.0)
+
+
+def to_grid(lon_deg: float, lat_deg: float, epsg: int) -> tuple[float, float, float]:
+    """Return easting and northing of a place, metres, and the bearing of true north there, degrees.
+
+    A bearing against true north plus this one is a bearing in the grid. All three are infinite beyond the projection.
+
+    >>> [round(value, 2) for value in to_grid(10.0, 47.0, 32632)]
+    [576025.31, 5205649.35, -0.73]
+    """
+    east_m, north_m = from_lonlat(epsg).transform(lon_deg, lat_deg)
+    if not (math.isfinite(east_m) and math.isfinite(north_m)):
+        return math.inf, math.inf, math.inf
+    return float(east_m), float(north_m), float(true_north_deg(np.array([lon_deg]), np.array([lat_deg]), epsg)[0])

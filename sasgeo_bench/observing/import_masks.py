@@ -14,9 +14,10 @@ from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.import_photos import ImportRequest, Perceived, table_of, view_cells, write_tasks
 from sasgeo_bench.observing.masks import MASKS, Legend, Strange, read_coco, read_mask
-from sasgeo_bench.observing.pictures import LEAST_M, WIDEST_M, grid_place, largest_square, open_picture
+from sasgeo_bench.observing.pictures import LEAST_M, WIDEST_M, largest_square, open_picture
 from sasgeo_bench.observing.posed_pictures import (
     GPS_SIGMA_M,
     PosedPicture,
@@ -200,7 +201,7 @@ def _georeferenced(path: Path, name: str, epsg: int, sigma_m: float | None) -> P
         raise CameraError(
             f"{path.name} has pixels of {across_m:.2f} x {down_m:.2f} m: warp it to a projected CRS (gdalwarp -r near)"
         )
-    east_m, north_m, convergence_deg = grid_place(*picture.lonlat, epsg)
+    east_m, north_m, convergence_deg = to_grid(*picture.lonlat, epsg)
     side_m = min(WIDEST_M, min(rows, cols) * picture.gsd_m)
     if side_m < LEAST_M:
         raise CameraError(f"{path.name} shows a square of {side_m:.0f} m, a view has at least {LEAST_M:g} m")

@@ -11,7 +11,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-import cv2
 import numpy as np
 
 from sasgeo_bench.core.errors import ConfigError, SasgeoError, counted, named
@@ -22,7 +21,7 @@ from sasgeo_bench.flights.odometry import Odometry, draw_odometry
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.observing.picture_poses import PoseFacts, PoseTable
-from sasgeo_bench.observing.pictures import list_pictures, names_of, see
+from sasgeo_bench.observing.pictures import averaged, list_pictures, names_of, see
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.observing.posed_pictures import Heights, PosedPicture, PosedPictures, lenses_of, pose_pictures
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
@@ -408,7 +407,8 @@ class TaskWriter:
     def _pictured(self, one: PosedPicture) -> Perceived:
         """Return a picture of which nothing is seen yet."""
         sight = see(one.picture)
-        image = _small(sight.image)
+        factor = math.ceil(max(sight.image.shape) / _MOST_PX)
+        image = sight.image if factor < 2 else averaged(sight.image, factor)
         east_m, north_m = sight.middle_m
         height_m = 0.0 if one.picture.camera is None else one.position_m[2]
         frame = Frame(
@@ -460,21 +460,3 @@ def _step(flight: str, frame: int, steps: Odometry) -> Step:
         increment=(float(steps.right_m[at]), float(steps.up_m[at]), float(steps.yaw_deg[at])),
         covariance=tuple(steps.covariance[at].ravel().tolist()),
     )
-
-
-def _small(image: AerialImage) -> AerialImage:
-    """Return a picture of `_MOST_PX` a side at most, by averages of whole pixels."""
-    factor = math.ceil(max(image.rgb.shape[:2]) / _MOST_PX)
-    if factor < 2:
-        return image
-    rows, cols = (side // factor for side in image.rgb.shape[:2])
-    rgb = cv2.resize(image.rgb[: rows * factor, : cols * factor], (cols, rows), interpolation=cv2.INTER_AREA)
-    lens = image.camera.intrinsics
-    lens = replace(
-        lens,
-        width_px=cols,
-        height_px=rows,
-        focal_px=(lens.focal_px[0] / factor, lens.focal_px[1] / factor),
-        centre_px=(lens.centre_px[0] / factor, lens.centre_px[1] / factor),
-    )
-    return replace(image, rgb=np.ascontiguousarray(rgb), camera=replace(image.camera, intrinsics=lens))

@@ -19,7 +19,7 @@ from sasgeo_bench.core.folders import locked
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.geometry.projection import to_lonlat
+from sasgeo_bench.geometry.projection import to_grid, to_lonlat
 from sasgeo_bench.matching.matcher import MatcherCard, Prediction, lacks
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.observing.chances import Answers, Chances, answers_for
@@ -27,7 +27,6 @@ from sasgeo_bench.observing.pictures import (
     OwnPicture,
     Sight,
     Told,
-    grid_place,
     list_pictures,
     names_of,
     open_picture,
@@ -292,7 +291,7 @@ def _region_of(request: LocateRequest, paths: Sequence[Path]) -> Path:
 
 def _holds(manifest: Manifest, place: tuple[float, float]) -> bool:
     try:
-        east_m, north_m, _ = grid_place(*place, manifest.epsg)
+        east_m, north_m, _ = to_grid(*place, manifest.epsg)
     except SasgeoError:
         return False
     west, south, east, north = manifest.bounds_m
@@ -423,7 +422,7 @@ class _Asker:
         place = request.near or (picture.lonlat if request.uses_position else None)
         centre_m = None
         where = place or _middle(manifest)
-        east_m, north_m, convergence_deg = grid_place(*where, manifest.epsg)
+        east_m, north_m, convergence_deg = to_grid(*where, manifest.epsg)
         if place is not None:
             west, south, east, north = manifest.bounds_m
             off_m = math.hypot(max(west - east_m, 0.0, east_m - east), max(south - north_m, 0.0, north_m - north))
@@ -527,10 +526,10 @@ class _Asker:
         view = answer.candidates[0][0]
         stood = sight.camera_pose(view)
         lon, lat = self._lonlat(stood.easting_m, stood.northing_m)
-        _, _, convergence_deg = grid_place(lon, lat, self._manifest.epsg)
+        _, _, convergence_deg = to_grid(lon, lat, self._manifest.epsg)
         away_m = None
         if picture.lonlat is not None:
-            east_m, north_m, _ = grid_place(*picture.lonlat, self._manifest.epsg)
+            east_m, north_m, _ = to_grid(*picture.lonlat, self._manifest.epsg)
             away_m = round(math.hypot(stood.easting_m - east_m, stood.northing_m - north_m), 2)
         p_false = None if self.chances is None else round(self.chances.p_false(answer), 4)
         status, reason = self._verdict(answer, p_false, query.prior)

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from sasgeo_bench.core.errors import PoseError, counted, named
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import bearing_deg
-from sasgeo_bench.geometry.projection import WGS84, between, from_lonlat, to_lonlat
+from sasgeo_bench.geometry.projection import WGS84, between, to_lonlat, true_north_deg
 from sasgeo_bench.sensing.camera import Attitude, Intrinsics
 
 Floats = NDArray[np.float64]
@@ -33,7 +33,6 @@ FARTHEST_M: Final = 50_000.0  # of a row from the median of all: no battery last
 SWAPPED: Final = "whose longitude and latitude are swapped"
 _LEVEL_DEG: Final = 85.0  # of tilt: a camera that leans more shows the horizon
 _EARTH_M: Final = 6_371_000.0
-_STEP_DEG: Final = 1e-4  # to the north, by which the grid's north is found
 _ORTHOGONAL: Final = 1e-3  # by which a rotation in a file may be off, from rounding
 # Rows of a camera's right, down, ahead in the axes of its body (forward, right, down); and of NED in east, north, up.
 _CAMERA_OF_BODY: Final = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
@@ -246,11 +245,8 @@ def convergence_deg(lonlat: Floats, epsg: int) -> Floats:
     """
     if check_crs(epsg):
         return np.zeros(len(lonlat))
-    lon, lat = lonlat.T
-    step = np.where(lat < 0, _STEP_DEG, -_STEP_DEG)  # never over a pole
-    here, there = (np.stack(from_lonlat(epsg).transform(lon, lat + more)) for more in (0.0, step))
-    east, north = np.sign(step) * (there - here)
-    return np.asarray((bearing_deg(east, north) + 180.0) % 360.0 - 180.0)
+    lon_deg, lat_deg = lonlat.T
+    return true_north_deg(lon_deg, lat_deg, epsg)
 
 
 def enu_of_ecef(lon_deg: float, lat_deg: float) -> Floats:

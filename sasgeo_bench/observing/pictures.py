@@ -25,7 +25,7 @@ from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import Pose, bearing_deg, rotation
-from sasgeo_bench.geometry.projection import from_lonlat
+from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.regions.layers import find_bands, selected
 from sasgeo_bench.sensing.camera import Attitude, Camera
 from sasgeo_bench.sensing.ground import Plane
@@ -252,12 +252,12 @@ def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
         heading_deg=sensor.yaw_deg if by else None,
         heading_by=by,
         scale_sigma=0.10,
-        camera=_north_up(sensor),
+        camera=above_origin(sensor),
         height_m=height_m,
     )
 
 
-def _north_up(camera: Camera) -> Camera:
+def above_origin(camera: Camera) -> Camera:
     """Return a camera above the origin, in axes in which its picture's up is north."""
     turn = np.eye(3)
     turn[:2, :2] = rotation(camera.yaw_deg)
@@ -309,19 +309,19 @@ class _Ground:
         x, y = source.transform @ (col, row)
         lon_deg, lat_deg = to_lonlat.transform(x, y, errcheck=True)
         epsg = utm_epsg(lon_deg, lat_deg)
-        to_grid = Transformer.from_crs(source.crs.to_wkt(), epsg, always_xy=True)
+        projected = Transformer.from_crs(source.crs.to_wkt(), epsg, always_xy=True)
         # Over many pixels: of one, rounding would show.
         cols = np.array([col, 0, source.width, col, col])
         rows = np.array([row, row, row, 0, source.height])
         xs, ys = source.transform @ (cols, rows)
-        east, north = to_grid.transform(xs, ys, errcheck=True)
+        east, north = projected.transform(xs, ys, errcheck=True)
         across, up = (east[2] - east[1], north[2] - north[1]), (east[3] - east[4], north[3] - north[4])
         width_m, height_m = math.hypot(*across), math.hypot(*up)
         gsd_m = math.sqrt(abs(across[0] * up[1] - across[1] * up[0]) / (source.width * source.height))
         if not (math.isfinite(gsd_m) and gsd_m > 0):
             raise GridError(f"pixels of {gsd_m!r} m")
         heading_deg = float(bearing_deg(*up))
-        _, _, convergence_deg = grid_place(lon_deg, lat_deg, epsg)
+        _, _, convergence_deg = to_grid(lon_deg, lat_deg, epsg)
         return cls(
             epsg=epsg,
             lonlat=(lon_deg, lat_deg),
@@ -331,15 +331,6 @@ class _Ground:
             true_heading_deg=(heading_deg - convergence_deg) % 360.0,
             size_m=(width_m, height_m),
         )
-
-
-def grid_place(lon_deg: float, lat_deg: float, epsg: int) -> tuple[float, float, float]:
-    """Return easting and northing, metres, and the bearing of true north in the grid, degrees."""
-    step_deg = 1e-4 if lat_deg < 0 else -1e-4  # never over a pole
-    east_m, north_m = from_lonlat(epsg).transform([lon_deg, lon_deg], [lat_deg, lat_deg + step_deg])
-    sign = math.copysign(1.0, step_deg)
-    bearing = float(bearing_deg(sign * (east_m[1] - east_m[0]), sign * (north_m[1] - north_m[0])))
-    return float(east_m[0]), float(north_m[0]), bearing
 
 
 def see(picture: OwnPicture, told: Told | None = None) -> Sight:
@@ -432,10 +423,10 @@ def _fitting(image: AerialImage, middle_m: tuple[float, float], side_m: float) -
     part = image.cropped(top, left, bottom - top, right - left)
     gsd_m = side_m / max(1.0, float(np.ptp(points, axis=0).min()) / _MARGIN)
     factor = int(FINEST_M / gsd_m)
-    return part if factor < 2 else _averaged(part, factor)
+    return part if factor < 2 else averaged(part, factor)
 
 
-def _averaged(image: AerialImage, factor: int) -> AerialImage:
+def averaged(image: AerialImage, factor: int) -> AerialImage:
     """Return a picture with pixels so many times as wide; rows and columns that fill no whole pixel are left out."""
     rows, cols = (side // factor for side in image.shape)
     rgb = cv2.resize(image.rgb[: rows * factor, : cols * factor], (cols, rows), interpolation=cv2.INTER_AREA)

@@ -398,7 +398,7 @@ def poses_of_sheet(path: Path, sheet: Sheet, facts: PoseFacts) -> Read:
         if len(cells) < count or any(cell.strip() for cell in cells[count:]):
             left_out[f"of other than the header's {counted(count, 'cell')}"].append(name or line)
             continue
-        place = _grid_place(columns, row) if is_grid else _place_of(columns, row)
+        place = _to_grid(columns, row) if is_grid else _place_of(columns, row)
         if not name:
             left_out["without a name"].append(line)
         elif isinstance(place, str):
@@ -449,7 +449,7 @@ def name_of(text: str) -> str:
     return text.replace("\\", "/").removeprefix("./")
 
 
-def _grid_place(columns: _Columns, row: Sequence[str]) -> tuple[float, float] | str:
+def _to_grid(columns: _Columns, row: Sequence[str]) -> tuple[float, float] | str:
     texts = [columns.cell(row, name) for name in ("east", "north")]
     if None in texts:
         return _NO_PLACE

@@ -16,13 +16,14 @@ from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, Sasge
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import Pose, rotation
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.picture_poses import PicturePose, PoseTable
 from sasgeo_bench.observing.pictures import (
     LEAST_M,
     STEEPEST_DEG,
     OwnPicture,
-    grid_place,
+    above_origin,
     largest_square,
     list_pictures,
     names_of,
@@ -179,7 +180,7 @@ def is_georeferenced(path: Path) -> bool:
 def _from_above(picture: OwnPicture, name: str, epsg: int, sigma_m: float | None) -> PosedPicture:
     """Return a georeferenced picture, which is seen from straight above."""
     assert picture.lonlat is not None  # noqa: S101 - by its georeference
-    east_m, north_m, convergence_deg = grid_place(*picture.lonlat, epsg)
+    east_m, north_m, convergence_deg = to_grid(*picture.lonlat, epsg)
     yaw_deg = ((picture.heading_deg or 0.0) + convergence_deg) % 360.0
     return PosedPicture(
         name=name,
@@ -257,7 +258,7 @@ def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: f
         return "without a position"
     if photo.gimbal is None:
         return "without angles of the camera (a column gimbal_pitch of -90 says straight down)"
-    place_m = grid_place(photo.lon_deg, photo.lat_deg, epsg)[:2] if row is None else row.in_crs(epsg)
+    place_m = to_grid(photo.lon_deg, photo.lat_deg, epsg)[:2] if row is None else row.in_crs(epsg)
     stated = of_file_m if row is None else row.sigma_m
     stated = sigma_m if stated is None else stated
     return _Stand(
@@ -332,7 +333,7 @@ def _posed(stand: _Stand, heights: Heights, dem: Dem | None) -> PosedPicture | s
             return f"whose camera is not known ({_reason(error, stand.name)})"
         if camera.tilt_deg > STEEPEST_DEG:
             return f"that look more than {STEEPEST_DEG:g} degrees away from straight down"
-        above = _above_origin(camera)
+        above = above_origin(camera)
         middle_m, side_m = largest_square(above.footprint(Plane()))
         if side_m < LEAST_M:
             return f"that show less ground than {LEAST_M:g} m a side"
@@ -383,14 +384,6 @@ def _height(stand: _Stand, heights: Heights, dem: Dem | None, at_m: tuple[float,
     assert dem is not None  # noqa: S101 - one of both
     ground_m = float(dem.heights_m(np.array([at_m]))[0])
     return altitude_m - ground_m if np.isfinite(ground_m) else "beyond the heights of the ground"
-
-
-def _above_origin(camera: Camera) -> Camera:
-    """Return a camera above the origin, in axes in which its picture's up is north."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(camera.yaw_deg)
-    a, b, c, d, e, f, g, h, i = (camera.matrix @ turn).ravel().round(15).tolist()
-    return replace(camera, east_m=0.0, north_m=0.0, rotation=(a, b, c, d, e, f, g, h, i))
 
 
 def lenses_of(pictures: Sequence[PosedPicture]) -> Mapping[str, int]:

@@ -22,8 +22,8 @@ from PIL import Image
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.texts import csv_cell, plain
+from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.locate import COLUMNS, Fix, Located, Seen, Watch
-from sasgeo_bench.observing.pictures import grid_place
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import paint_overview, pooled
@@ -362,6 +362,6 @@ def _discs(located: Located, fixes: Sequence[Fix]) -> list[tuple[float, float, f
     found = []
     for fix in fixes:
         if fix.prior_lon is not None and fix.prior_lat is not None and fix.prior_radius_m is not None:
-            east_m, north_m, _ = grid_place(fix.prior_lon, fix.prior_lat, located.manifest.epsg)
+            east_m, north_m, _ = to_grid(fix.prior_lon, fix.prior_lat, located.manifest.epsg)
             found.append((east_m, north_m, fix.prior_radius_m))
     return found

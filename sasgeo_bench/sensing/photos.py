@@ -19,8 +19,7 @@ from sasgeo_bench.core.errors import CameraError, ImageError
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import message_of, one_line
 from sasgeo_bench.geometry.grid import utm_epsg
-from sasgeo_bench.geometry.pose import bearing_deg
-from sasgeo_bench.geometry.projection import from_lonlat
+from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
 
 _TIFF_MARKS: Final = (b"II*\0", b"MM\0*")
@@ -393,7 +392,6 @@ MOST_BYTES: Final = 64 * 2**20  # of a photo
 
 _STRAIGHT_DOWN_DEG: Final = -90.0
 _HORIZON_DEG: Final = 90.0 - 1e-6  # of tilt; the optical axis of a camera that leans more meets no level ground
-_STEP_DEG: Final = 1e-4  # to the north, by which the grid's north is found
 _UNITS_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's units of FocalPlaneXResolution
 
 # EXIF's orientation -> right and down of the upright picture in those of the sensor; 0 is none, the others mirror.
@@ -496,7 +494,7 @@ class Photo:
                 "above the ground (height_m)"
             )
         crs = epsg or utm_epsg(self.lon_deg, self.lat_deg)
-        east_m, north_m, convergence_deg = _to_grid(self.lon_deg, self.lat_deg, crs)
+        east_m, north_m, convergence_deg = to_grid(self.lon_deg, self.lat_deg, crs)
         sensor = Camera.mounted(
             intrinsics=intrinsics or self.intrinsics(),
             east_m=east_m,
@@ -511,14 +509,6 @@ class Photo:
                 "straight down; some drones write 0 for unknown): leave it out, or make the camera by `Camera.pointed`"
             )
         return sensor.upright(_TURNS[self.orientation])
-
-
-def _to_grid(lon_deg: float, lat_deg: float, epsg: int) -> tuple[float, float, float]:
-    """Return easting, northing and the bearing of true north in the grid, degrees."""
-    step_deg = -_STEP_DEG if lat_deg > 0 else _STEP_DEG  # never over a pole
-    (here_m, there_m), (low_m, high_m) = from_lonlat(epsg).transform([lon_deg, lon_deg], [lat_deg, lat_deg + step_deg])
-    sign = math.copysign(1.0, step_deg)
-    return here_m, low_m, float(bearing_deg(sign * (there_m - here_m), sign * (high_m - low_m)))
 
 
 def read_photo(path: str | Path, *, most_bytes: int = MOST_BYTES, most_pixels: int = 200_000_000) -> Photo:

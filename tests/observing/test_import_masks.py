@@ -12,8 +12,7 @@ from PIL import ExifTags, Image
 
 import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import ConfigError
-from sasgeo_bench.geometry.projection import to_lonlat
-from sasgeo_bench.observing.pictures import grid_place
+from sasgeo_bench.geometry.projection import to_grid, to_lonlat
 from sasgeo_bench.tasks.task_files import Task
 from tests.observing.test_pictures import turned
 from tests.sensing.test_photos import POSE, write_photo, xmp_of
@@ -104,7 +103,7 @@ def test_a_georeferenced_mask_is_evidence_of_the_map_where_it_lies(own_out, regi
 def photo_at(path: Path, region: sgb.Region, pose: sgb.Pose, *, size=(SIDE, SIDE)) -> Path:
     """A photo from straight above whose pixels are those of the mask."""
     lon, lat = to_lonlat(region.grid.epsg).transform(pose.easting_m, pose.northing_m)
-    true_deg = (pose.yaw_deg - grid_place(lon, lat, region.grid.epsg)[2] + 180) % 360 - 180
+    true_deg = (pose.yaw_deg - to_grid(lon, lat, region.grid.epsg)[2] + 180) % 360 - 180
     focal_px = 24.0 * np.hypot(*size) / np.hypot(36.0, 24.0)
     down = POSE | {
         "RelativeAltitude": f"{focal_px * PIXEL_M:+.4f}",

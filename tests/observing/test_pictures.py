@@ -15,11 +15,11 @@ from pyproj import Geod, Transformer
 
 from sasgeo_bench.core.errors import CameraError, ImageError
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.pictures import (
     FINEST_M,
     WIDEST_M,
     Told,
-    grid_place,
     largest_square,
     list_pictures,
     open_picture,
@@ -188,10 +188,9 @@ def test_the_square_is_the_largest_and_the_nearest(footprint, middle_m, side_m):
 
 def test_true_north_in_the_grid_is_that_of_the_ellipsoid():
     for lon, lat, epsg in ((11.9, 60.0, 32632), (6.1, -33.0, 32732), (9.0, 10.0, 32632)):
-        east_m, north_m, bearing_deg = grid_place(lon, lat, epsg)
+        east_m, north_m, bearing_deg = to_grid(lon, lat, epsg)
         lon2, lat2, _ = GEOD.fwd(lon, lat, 0.0, 100.0)
-        to_grid = Transformer.from_crs(4326, epsg, always_xy=True)
-        x, y = to_grid.transform(lon2, lat2)
+        x, y = Transformer.from_crs(4326, epsg, always_xy=True).transform(lon2, lat2)
         expected = math.degrees(math.atan2(x - east_m, y - north_m))
         assert (bearing_deg - expected + 180) % 360 - 180 == pytest.approx(0.0, abs=0.01)
 

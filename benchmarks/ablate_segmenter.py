@@ -12,7 +12,8 @@ taught from nothing, by the same recipe and number of steps, then asked at `--pl
 - `drawn-without-NAME`: a switch of `Ingredients` off
 
 A result lies in `--out`/segmenters/ablations and is not made again; an arm that was cut off goes on from its last part
-of steps. `--table` prints what lies there, without PyTorch. In brackets is the difference to the arm's base. A network
+of steps. `--table` prints what lies there, without PyTorch. In brackets is the difference to the arm's base; a second
+table has those of the drawn world alone, for the places in their order. A network
 of another seed differs too: what is not far above the row of `drawn-again` says nothing.
 """
 
@@ -198,6 +199,23 @@ def table(results: Mapping[str, Result]) -> str:
     return "\n".join(lines)
 
 
+def differences(results: Mapping[str, Result]) -> str:
+    """Return how much less the drawn world teaches without an ingredient, by class, a place after the other."""
+    lines = [f"| arm | {' | '.join(SHOWN)} |", f"|---|{'---|' * len(SHOWN)}"]
+    for arm, result in results.items():
+        base = results.get(ARMS[arm].base or "")
+        if base is None or ARMS[arm].base != "drawn":
+            continue
+        cells = []
+        for name in SHOWN:
+            pairs = [
+                (found.areas.get(name), base.places[place].areas.get(name)) for place, found in result.places.items()
+            ]
+            cells.append(", ".join(f"{area.auc - other.auc:+.2f}" for area, other in pairs if area and other) or "-")
+        lines.append(f"| {arm} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def planned(arguments: Sequence[str] | None = None) -> tuple[Plan, bool]:
     """Parse the command line: what is asked for, and whether the table alone is."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -230,7 +248,7 @@ def main() -> None:
         results = {arm: result for arm in ARMS if (result := plan.result(arm))}
         if is_table and not results:
             raise SystemExit(f"no arm of {plan.steps} steps is done in {plan.out / FOLDER}: leave --table out, once")
-        print(table(results))
+        print(table(results), differences(results), sep="\n\n")
     except SasgeoError as error:
         raise SystemExit(str(error)) from error
 

@@ -21,6 +21,7 @@ from benchmarks.ablate_segmenter import (
     Plan,
     Result,
     check_untaught,
+    differences,
     middle_of,
     planned,
     stride_of,
@@ -238,6 +239,11 @@ def test_a_table_says_how_far_an_arm_is_from_its_base():
         "| drawn | shore | 9 | 0.900 | - | 0.750 | - | - |",
         "| drawn-without-cars | hill | 9 | 0.888 (-0.012) | 0.500 | 0.750 (+0.000) | - | - |",
         "| drawn-without-cars | shore | 9 | 0.888 (-0.012) | 0.500 | 0.750 (+0.000) | - | - |",
+    ]
+    assert differences(results).splitlines() == [
+        "| arm | building | road | water | green | farmland |",
+        "|---|---|---|---|---|---|",
+        "| drawn-without-cars | -0.01, -0.01 | - | +0.00, +0.00 | - | - |",
     ]
 
 

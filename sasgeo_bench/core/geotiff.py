@@ -59,6 +59,23 @@ def open_database(path: Path, layer: str | None = None) -> Iterator["DatasetRead
             yield source
 
 
+@contextmanager
+def open_png(path: Path) -> Iterator["DatasetReader"]:
+    """Open a PNG to read the values that are stored in it, whatever they are shown as; files beside it are passed over.
+
+    Raise `RasterioIOError` if it is none.
+    """
+    import rasterio  # noqa: PLC0415 - GDAL is slow to import
+    from rasterio.errors import NotGeoreferencedWarning  # noqa: PLC0415
+
+    with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", GDAL_PAM_ENABLED="NO"):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            source = rasterio.open(plain_file(path), driver="PNG")
+        with source:
+            yield source
+
+
 def is_database(path: Path) -> bool:
     """Return whether a file is an SQLite database, as MBTiles and GeoPackages are."""
     with plain_file(path).open("rb") as file:

@@ -42,7 +42,7 @@ _TAKEN: Final = frozenset(
             "osmium",
             "pandas",
         ),
-        *("pooch", "psutil", "pyarrow", "pydantic", "pyproj", "rasterio", "rich"),
+        *("pooch", "psutil", "pyarrow", "pydantic", "pyogrio", "pyproj", "rasterio", "rich"),
         *("scipy", "shapely", "tifffile", "torch", "tqdm", "typer", "click"),
         *("dask", "distributed", "fsspec", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
         *("hatchling", "hypothesis", "jinja2", "mlcroissant", "pip", "pystac", "pytest", "rio_cogeo", "setuptools"),

@@ -16,6 +16,7 @@ import numpy as np
 from sasgeo_bench.core import progress
 from sasgeo_bench.core.errors import ConfigError, MatchError, SasgeoError, StoreError, counted
 from sasgeo_bench.core.folders import locked
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.pose import Pose, Prior
@@ -248,7 +249,7 @@ def _kept(path: Path) -> dict[str, Fix]:
     if not path.is_file():
         return {}
     found = {}
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in plain_file(path).read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             row = json.loads(line)
             view = row["fix"].pop("view")

@@ -21,7 +21,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from sasgeo_bench.core.config import Document, parse_toml
 from sasgeo_bench.core.errors import ConfigError, ImageError, named
-from sasgeo_bench.core.geotiff import open_geotiff
+from sasgeo_bench.core.geotiff import open_geotiff, open_png
 from sasgeo_bench.core.json import parse_json
 from sasgeo_bench.core.paths import plain_file, read_bounded
 from sasgeo_bench.core.texts import one_line, plain
@@ -205,14 +205,7 @@ def _opened(path: Path) -> Iterator[rasterio.io.DatasetReader]:
     """Open a PNG or a TIFF, without the files beside it, with the values that are stored in it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # where it lies is in a table of poses
-        if path.suffix.lower() != ".png":
-            with open_geotiff(path) as source:
-                yield source
-            return
-        with (
-            rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"),
-            rasterio.open(plain_file(path), driver="PNG") as source,
-        ):
+        with open_png(path) if path.suffix.lower() == ".png" else open_geotiff(path) as source:
             yield source
 
 

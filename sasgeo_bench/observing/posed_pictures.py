@@ -14,6 +14,7 @@ from rasterio.errors import RasterioError
 
 from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError, counted
 from sasgeo_bench.core.geotiff import open_geotiff
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
@@ -276,7 +277,7 @@ def _photo(path: Path) -> tuple[Photo, float | None]:
     """Return what a file says of its picture, and the standard deviation of its place if it states one."""
     if path.suffix.lower() in (".png", ".webp"):
         try:
-            with Image.open(path, formats=("PNG", "WEBP")) as image:
+            with Image.open(plain_file(path), formats=("PNG", "WEBP")) as image:
                 return Photo(name=path.name, width_px=image.width, height_px=image.height), None
         except (OSError, Image.DecompressionBombError) as error:
             raise ImageError(f"{path.name} is no sound picture: copy it again") from error

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from sasgeo_bench.core.config import Document, Line
-from sasgeo_bench.core.errors import CoverageError, ExtractError, counted, named
+from sasgeo_bench.core.errors import CoverageError, ExtractError, StoreError, counted, named
+from sasgeo_bench.core.parquet import MOST_VALUES, VERIFIED, open_table, read_schema
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
@@ -286,10 +287,8 @@ class _Geo(NamedTuple):
 
 
 def _geo(path: Path) -> _Geo:
-    import pyarrow.parquet as pq  # noqa: PLC0415 - few regions have a map that needs it
-
     try:
-        with pq.ParquetFile(path) as file:
+        with open_table(path, mend="write it with geopandas", most_rows=MOST_VALUES, is_whole=False) as file:
             unpacked = sum(file.metadata.row_group(at).total_byte_size for at in range(file.num_row_groups))
             about = json.loads((file.schema_arrow.metadata or {})[b"geo"])
         primary = str(about["primary_column"])
@@ -297,11 +296,11 @@ def _geo(path: Path) -> _Geo:
         # By the specification longitude and latitude where nothing is said, unknown where null is
         stated = column.get("crs", f"EPSG:{WGS84}")
         crs = None if stated is None else pyproj.CRS.from_user_input(stated)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, pyproj.exceptions.CRSError) as error:
+    except StoreError as error:
+        raise ExtractError(str(error)) from error
+    except (ValueError, KeyError, TypeError, AttributeError, pyproj.exceptions.CRSError) as error:
         why = f"no {error} in it" if isinstance(error, KeyError) else one_line(str(error))[:200]
-        raise ExtractError(
-            f"{path} cannot be read as GeoParquet ({why}): write it with geopandas.to_parquet"
-        ) from error
+        raise ExtractError(f"{path} cannot be read as GeoParquet ({why}): write it with geopandas") from error
     if unpacked > MOST_UNPACKED:
         raise ExtractError(f"{path} unpacks to more than {MOST_UNPACKED / 1e9:g} GB: cut it to the region")
     return _Geo(primary, crs, "covering" in column)
@@ -367,17 +366,18 @@ def _bounds(shapes: Geometries) -> list[float]:
 
 def _read_parquet(source: _Source, table: ClassTable, box: Box) -> _Rows:
     import geopandas as gpd  # noqa: PLC0415 - few regions have a map that needs it
-    import pyarrow.parquet as pq  # noqa: PLC0415
 
     path, about = source.path, _geo(source.path)
+    named_columns = read_schema(path, mend="get it again").names
     wanted = [one for one in (table.column, table.width_column) if one is not None]
     for column in wanted:
-        _check_column(path, column, [name for name in pq.read_schema(path).names if name != about.primary])
+        _check_column(path, column, [name for name in named_columns if name != about.primary])
     boxed = {"bbox": box} if about.has_boxes else {}
     try:
-        frame = gpd.read_parquet(path, columns=list(dict.fromkeys([*wanted, about.primary])), **boxed)
+        columns = list(dict.fromkeys([*wanted, about.primary]))
+        frame = gpd.read_parquet(path, columns=columns, **boxed, **VERIFIED)
         if about.has_boxes and frame.empty:  # to say where it lies
-            frame = gpd.read_parquet(path, columns=[*wanted, about.primary])
+            frame = gpd.read_parquet(path, columns=columns, **VERIFIED)
     except (OSError, ValueError, KeyError, shapely.errors.ShapelyError) as error:
         raise ExtractError(f"{path} cannot be read as GeoParquet ({one_line(str(error))[:200]})") from error
     if frame.empty:

@@ -305,4 +305,4 @@ def test_maps_of_each_age_are_those_nearest_by_ratio(dates):
 def test_a_request_needs_the_extract_of_its_region_and_the_map_of_ones_own_beside_it(tmp_path):
     (request,) = plan(tmp_path, regions=("koeln-ortho",), split="world")
     needed = {extract.file: extract.format for extract in request.extracts}
-    assert needed == {"koeln-2026-08-06.osm.pbf": "osm", "koeln-messe-lod2-footprints.geojson": "geojson"}
+    assert needed == {"koeln-2026-08-06.osm.pbf": "osm", "koeln-messe-lod2-footprints.geojson": "own_map"}

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
+import numpy as np
 import pyproj
 import shapely
 from pydantic import ConfigDict, Field, StringConstraints, field_validator, model_validator
@@ -34,6 +35,7 @@ MAX_AREA_KM2: Final = 100_000.0
 MAX_CELLS: Final = 4e9
 _EDGE_POINTS: Final = 21
 _M_PER_DEG: Final = 111_320.0
+_MOST_STRETCH: Final = 0.01  # of a CRS: a metre of its map is one on the ground, to 1 %
 
 Scene = Literal[
     "urban",
@@ -273,8 +275,23 @@ class RegionFile(NamedDocument):
         if self.size_m is not None and not all(math.isfinite(side) and side > 0 for side in self.size_m):
             raise ValueError(f"size_m must be two positive lengths, got {list(self.size_m)!r}")
         _check_size(*self._size_estimate_m(), self.cell_size_m)
+        self._check_scale()
         self._check_antimeridian()
         return self
+
+    def _check_scale(self) -> None:
+        """Refuse a CRS whose metres are not those of the ground here, as those of web maps: sizes would be wrong."""
+        if self.epsg is None:
+            return
+        west, south, east, north = self.lonlat_box()
+        factors = pyproj.Proj(self.epsg).get_factors([west, west, east, east], [south, north, south, north])
+        scales = np.concatenate([factors.meridional_scale, factors.parallel_scale])
+        worst = float(scales[np.argmax(np.abs(scales - 1))])
+        if abs(worst - 1) > _MOST_STRETCH:  # not so where it is no number: `grid` says that
+            raise ValueError(
+                f"epsg {self.epsg} stretches this place by {worst:.2f}: its metres are not those of the ground; leave "
+                "epsg out for the UTM zone"
+            )
 
     def _check_antimeridian(self) -> None:
         """Refuse a region across 180 degrees of longitude, before anything is read: ways and boxes end there."""

@@ -67,6 +67,8 @@ def test_a_place_that_is_none_is_refused_with_the_mend(place, words):
     [
         (text(more="epsg = 4326"), "not a projected CRS in metres"),
         (text(more="epsg = 999999"), "unknown"),
+        (text(more="epsg = 3857"), "epsg 3857 stretches this place by 1.4"),  # a web map, whose 400 m are 268 m
+        (text(more="epsg = 5041"), "epsg 5041 stretches this place by"),  # the pole's
         (text(more="coverage_lonlat = [[9.0, 47.0], [9.1, 47.0]]"), "at least 3"),
         (text(more="cell_sise = 3"), "unknown key 'cell_sise'"),
         *((text(cell=cell), "cell_size_m must lie between") for cell in ("0.0", "-1.0", "nan", "inf", "1e6")),

@@ -185,8 +185,8 @@ class PoseTable:
     def find(self, picture: str | Path) -> PicturePose | None:
         """Return the pose of a picture, by its path; None if the table has none.
 
-        Folders decide between pictures of one name, as far as the table has them; letter case does not count, and a
-        name without a suffix fits any. Raise `PoseError` if two rows fit alike.
+        Folders decide between pictures of one name, as far as the table has them: a row of another folder is none.
+        Letter case does not count, and a name without a suffix fits any. Raise `PoseError` if two rows fit alike.
 
         >>> poses = tuple(PicturePose(name=f"{day}/a.JPG", place=(9.0, 47.0)) for day in ("may", "june"))
         >>> PoseTable(path=Path("t.csv"), kind="CSV", poses=poses).find("photos/june/a.jpg").name
@@ -194,7 +194,9 @@ class PoseTable:
         """
         parts = _parts(str(picture))
         near = self._by_name.get(parts[-1], []) or self._by_name.get(PurePosixPath(parts[-1]).stem, [])
-        common = [_common(_parts(self.poses[at].name)[:-1], parts[:-1]) for at in near]
+        above = {at: _parts(self.poses[at].name)[:-1] for at in near}
+        near = [at for at in near if not above[at] or not parts[:-1] or above[at][-1] == parts[-2]]
+        common = [_common(above[at], parts[:-1]) for at in near]
         best = [at for at, count in zip(near, common, strict=True) if count == max(common)]
         if len(best) > 1:
             raise PoseError(

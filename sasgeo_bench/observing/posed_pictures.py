@@ -2,9 +2,11 @@
 """Pictures of a user's own with the pose of each in the CRS of a map, from their files, a table and heights."""
 
 import datetime as dt
-from collections import defaultdict
+import math
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Final
 
@@ -14,12 +16,12 @@ from rasterio.errors import RasterioError
 
 from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError, counted
 from sasgeo_bench.core.geotiff import open_geotiff
-from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import to_grid
-from sasgeo_bench.observing.picture_poses import PicturePose, PoseTable
+from sasgeo_bench.observing.picture_poses import PicturePose, PoseTable, picture_heading_deg
 from sasgeo_bench.observing.pictures import (
     LEAST_M,
     STEEPEST_DEG,
@@ -31,15 +33,16 @@ from sasgeo_bench.observing.pictures import (
     open_picture,
     see,
 )
-from sasgeo_bench.sensing.camera import Camera, Intrinsics
+from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
-from sasgeo_bench.sensing.photos import DJI, Photo, number_of, read_head, read_photo
+from sasgeo_bench.sensing.photos import DJI, Photo, PhotoHead, number_of, photo_of, read_head, read_photo
 
 GPS_SIGMA_M: Final = 3.3  # of one axis: 95 % within 8 m, as the GPS performance standard of 2020 states it
 _TILT_SIGMA: Final = 0.0175  # metres to a metre of height: a gimbal is right to a degree
 _MOST_BYTES: Final = 64 * 2**20
 _SAME_SHAPE: Final = 0.01  # by which the aspects of a picture and of a smaller copy differ, from rounding
 _CELL_M: Final = 10.0  # of the lattice of heights; GLO-30 and SRTM have 30 m
+_NADIR_DEG: Final = 5.0  # of tilt: a camera that leans less looks straight down, but for the wind
 _AROUND_M: Final = 400.0  # of ground around the cameras whose heights are read
 
 
@@ -133,6 +136,7 @@ def pose_pictures(
     found = PosedPictures()
     paths = list_pictures(folder)
     seen: list[_Stand] = []
+    taken: Counter[str] = Counter()
     for path, name in zip(paths, names_of(paths, folder), strict=True):
         try:
             if path.suffix.lower() in (".tif", ".tiff"):
@@ -144,14 +148,20 @@ def pose_pictures(
             if table is not None and row is None:
                 found.left_out["that the table does not name"].append(name)
                 continue
+            taken[row.name if row is not None else ""] += 1
             stand = _stand(path, name, row, epsg, sigma_m)
         except SasgeoError as error:
-            found.left_out[f"that cannot be read ({_reason(error, name)})"].append(name)
+            found.left_out[f"that cannot be read ({reason_of(error, path)})"].append(name)
             continue
         if isinstance(stand, str):
             found.left_out[stand].append(name)
         else:
             seen.append(stand)
+    for stand in [stand for stand in seen if stand.row is not None and taken[stand.row.name] > 1]:
+        seen.remove(stand)
+        found.left_out["of one name, for which the table has one row (name their folders there)"].append(stand.name)
+    headings = Counter(stand.heading_note for stand in seen if stand.heading_note)
+    found.notes += [f"{note} ({counted(count, 'picture')})" for note, count in headings.items()]
     found.notes += _clocks(seen)
     ground = _ground(heights, seen, epsg, found) if seen else None
     for stand in seen:
@@ -164,9 +174,13 @@ def pose_pictures(
     return found
 
 
-def _reason(error: SasgeoError, name: str) -> str:
-    """Return the text of an error without the name of its picture, so that like faults are counted together."""
-    return plain(str(error)).replace(name, "it").replace(name.rpartition("/")[2], "it")[:160]
+def reason_of(error: SasgeoError, path: Path) -> str:
+    """Return the text of an error without the path or name of its picture, so that like faults are counted together.
+
+    >>> reason_of(ImageError("photos/a.jpg is no JPEG"), Path("photos/a.jpg"))
+    'it is no JPEG'
+    """
+    return plain(str(error)).replace(plain(str(path)), "it").replace(plain(path.name), "it")[:160]
 
 
 def is_georeferenced(path: Path) -> bool:
@@ -205,12 +219,13 @@ class _Stand:
     place_m: tuple[float, float]
     sigma_m: float
     epsg: int
+    heading_note: str = ""
 
     @property
     def altitude(self) -> tuple[float | None, str]:
         if self.row is not None and self.row.altitude_m is not None:
             return self.row.altitude_m, self.row.altitude_of
-        return self.photo.altitude_m, "sea"
+        return self.photo.altitude_m, "ellipsoid" if self.photo.is_ellipsoidal else "sea"
 
     @property
     def exif_s(self) -> float | None:
@@ -248,13 +263,18 @@ def _fitted(lens: Intrinsics, photo: Photo) -> Intrinsics | None:
 def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: float | None) -> _Stand | str:
     """Return where a photo was taken, or why that is not known."""
     photo, of_file_m = _photo(path)
+    heading_note = ""
     if row is not None:
-        if row.attitude is not None and photo.orientation != 1:
+        if photo.orientation != 1 and not (row.attitude is None and row.heading_deg is None):
             return "that EXIF turns, so that the table's angles may be of another picture"
         lon, lat = row.lonlat
-        photo = replace(photo, lon_deg=lon, lat_deg=lat)
+        photo = replace(photo, lon_deg=lon, lat_deg=lat, place_fault="")
         if row.attitude is not None:
             photo = replace(photo, gimbal=row.attitude, gimbal_fault="")
+        elif row.heading_deg is not None:
+            photo, heading_note = _headed(photo, row.heading_deg)
+    if photo.place_fault:
+        return f"with a position {photo.place_fault}: convert it"
     if photo.lon_deg is None or photo.lat_deg is None:
         return "without a position"
     if photo.gimbal is None:
@@ -270,17 +290,33 @@ def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: f
         place_m=place_m,
         sigma_m=GPS_SIGMA_M if stated is None else stated,
         epsg=epsg,
+        heading_note=heading_note,
     )
+
+
+def _headed(photo: Photo, heading_deg: float) -> tuple[Photo, str]:
+    """Return a photo with the heading of a table that has no pitch, and what to say of it."""
+    gimbal = Attitude(pitch_deg=-90.0) if photo.gimbal is None and not photo.gimbal_fault else photo.gimbal
+    if gimbal is None or gimbal.matrix[2, 0] < math.cos(math.radians(_NADIR_DEG)):
+        return photo, "not used: the table's heading, without a pitch, of cameras that do not look straight down"
+    more_deg = heading_deg - picture_heading_deg(gimbal)
+    note = "the table has a heading and no pitch: taken as cameras that look straight down"
+    return replace(photo, gimbal=replace(gimbal, yaw_deg=gimbal.yaw_deg + more_deg)), note
 
 
 def _photo(path: Path) -> tuple[Photo, float | None]:
     """Return what a file says of its picture, and the standard deviation of its place if it states one."""
     if path.suffix.lower() in (".png", ".webp"):
         try:
-            with Image.open(plain_file(path), formats=("PNG", "WEBP")) as image:
-                return Photo(name=path.name, width_px=image.width, height_px=image.height), None
-        except (OSError, Image.DecompressionBombError) as error:
+            data = read_bounded(path, _MOST_BYTES)
+            with Image.open(BytesIO(data), formats=("PNG", "WEBP")) as image:
+                # Pillow decodes a PNG to look for EXIF behind its pixels.
+                exif = image.getexif() if "exif" in image.info or b"exif" in data.lower() else {}
+                turned = {ExifTags.Base.Orientation: exif.get(ExifTags.Base.Orientation, 1)}
+                head = PhotoHead(size_px=image.size, exif=turned, inner={}, gps={}, xmp={})
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # SyntaxError: Pillow's
             raise ImageError(f"{path.name} is no sound picture: copy it again") from error
+        return photo_of(path.name, head), None
     head = read_head(path)
     spreads = [number_of(head.xmp.get((DJI, f"RtkStd{axis}"))) for axis in ("Lon", "Lat")]
     known = [value for value in spreads if value is not None and value > 0]
@@ -331,7 +367,7 @@ def _posed(stand: _Stand, heights: Heights, dem: Dem | None) -> PosedPicture | s
         try:
             camera = stand.camera(height_m)
         except CameraError as error:
-            return f"whose camera is not known ({_reason(error, stand.name)})"
+            return f"whose camera is not known ({reason_of(error, stand.path)})"
         if camera.tilt_deg > STEEPEST_DEG:
             return f"that look more than {STEEPEST_DEG:g} degrees away from straight down"
         above = above_origin(camera)
@@ -378,10 +414,10 @@ def _height(stand: _Stand, heights: Heights, dem: Dem | None, at_m: tuple[float,
         )
     if altitude_m is None:
         return "without an altitude"
-    if heights.takeoff_m is not None:
-        return altitude_m - heights.takeoff_m
     if of == "ellipsoid":
         return "whose altitude counts from the ellipsoid, where the ground's heights do from the sea: convert it"
+    if heights.takeoff_m is not None:
+        return altitude_m - heights.takeoff_m
     assert dem is not None  # noqa: S101 - one of both
     ground_m = float(dem.heights_m(np.array([at_m]))[0])
     return altitude_m - ground_m if np.isfinite(ground_m) else "beyond the heights of the ground"

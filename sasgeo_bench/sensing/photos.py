@@ -3,6 +3,7 @@
 
 import datetime as dt
 import math
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.core.errors import CameraError, ImageError
 from sasgeo_bench.core.paths import plain_file
-from sasgeo_bench.core.texts import message_of, one_line
+from sasgeo_bench.core.texts import message_of, one_line, plain
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
@@ -217,8 +218,28 @@ def height_above_m(xmp: Xmp) -> float | None:
 
 
 def altitude_m(xmp: Xmp) -> float | None:
-    """Return the height above the sea, metres."""
+    """Return the altitude, metres: above the sea, unless `is_ellipsoidal`."""
     return _first(xmp, _ALTITUDE)
+
+
+def is_ellipsoidal(altitude_type: str) -> bool:
+    """Return whether DJI's AltitudeType says that an absolute altitude counts from the ellipsoid, as RTK's do.
+
+    >>> is_ellipsoidal("RtkAlt"), is_ellipsoidal("GpsFusionAlt")
+    (True, False)
+    """
+    return altitude_type.strip().lower() == "rtkalt"
+
+
+def datum_fault(datum: str) -> str:
+    """Return what is wrong with EXIF's GPSMapDatum, empty where it is WGS 84, in any spelling, or not said.
+
+    >>> datum_fault("WGS-84"), datum_fault("TOKYO")
+    ('', "in another datum than WGS 84 ('TOKYO')")
+    """
+    key = re.sub(r"[^A-Z0-9]", "", datum.upper())
+    is_meant = not key or re.match(r"WGS(19)?84|WORLDGEODETICSYSTEM(19)?84|EPSG4326$", key)
+    return "" if is_meant else f"in another datum than WGS 84 ({plain(datum)[:40]!r})"
 
 
 def _first(xmp: Xmp, keys: tuple[tuple[str, str], ...]) -> float | None:
@@ -409,8 +430,9 @@ class Photo:
     """Metadata of a photo, as its file says it; None where it does not.
 
     `width_px`, `height_px` are of the upright picture, as `decode_image` returns it; `orientation` is EXIF's number.
-    Longitude and latitude are WGS 84. `height_m` counts from the place of take-off, `altitude_m` from the sea (by GNSS
-    or barometer, often tens of metres off). Angles are against true north: `gimbal` of the camera, with pitch -90
+    Longitude and latitude are WGS 84; `place_fault` says why there are none though the file has a place. `height_m`
+    counts from the place of take-off, `altitude_m` from the sea (by GNSS or barometer, often tens of metres off), or
+    from the ellipsoid if `is_ellipsoidal`. Angles are against true north: `gimbal` of the camera, with pitch -90
     straight down whatever the drone's maker counts from, and `flight` of the body. `gimbal_fault` says why the file's
     angles of the camera are not understood.
     """
@@ -421,8 +443,10 @@ class Photo:
     orientation: int = 1
     lon_deg: float | None = None
     lat_deg: float | None = None
+    place_fault: str = ""
     height_m: float | None = None
     altitude_m: float | None = None
+    is_ellipsoidal: bool = False
     gimbal: Attitude | None = None
     gimbal_fault: str = ""
     flight: Attitude | None = None
@@ -479,6 +503,8 @@ class Photo:
         height_m = self.height_m if height_m is None else height_m
         if self.gimbal_fault:
             raise CameraError(f"{self.name} has {self.gimbal_fault}: make the camera by `Camera.pointed`")
+        if self.place_fault:
+            raise CameraError(f"{self.name} has a place {self.place_fault}: make the camera by `Camera.pointed`")
         if self.lon_deg is None or self.lat_deg is None or height_m is None or self.gimbal is None:
             facts = {"GPS": self.lon_deg, "height above take-off": height_m, "gimbal angles": self.gimbal}
             lacking = [name for name, value in facts.items() if value is None]
@@ -521,10 +547,11 @@ def read_photo(path: str | Path, *, most_bytes: int = MOST_BYTES, most_pixels: i
     size = path.stat().st_size if path.is_file() else 0  # what is no file is refused when it is opened
     if size > most_bytes:
         raise ImageError(f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first")
-    return _photo_of(path.name, read_head(path), most_pixels)
+    return photo_of(path.name, read_head(path), most_pixels=most_pixels)
 
 
-def _photo_of(name: str, head: PhotoHead, most_pixels: int) -> Photo:
+def photo_of(name: str, head: PhotoHead, *, most_pixels: int = 200_000_000) -> Photo:
+    """Return a photo by its head; raise `ImageError` if it is too large, mirrored or damaged."""
     width_px, height_px = head.size_px
     if width_px * height_px > most_pixels or min(head.size_px) < 1:
         raise ImageError(
@@ -536,6 +563,9 @@ def _photo_of(name: str, head: PhotoHead, most_pixels: int) -> Photo:
     if _TURNS[orientation][0][0] == 0:
         width_px, height_px = height_px, width_px
     lon_deg, lat_deg = _place(head.gps)
+    place_fault = "" if lon_deg is None else datum_fault(_text(head.gps.get(ExifTags.GPS.GPSMapDatum)))
+    if place_fault:
+        lon_deg = lat_deg = None
     make = _text(head.exif.get(ExifTags.Base.Make)) or head.xmp.get(("http://ns.adobe.com/tiff/1.0", "Make"), "")
     angles = camera_angles(head.xmp, make)
     return Photo(
@@ -545,8 +575,10 @@ def _photo_of(name: str, head: PhotoHead, most_pixels: int) -> Photo:
         orientation=orientation,
         lon_deg=lon_deg,
         lat_deg=lat_deg,
+        place_fault=place_fault,
         height_m=height_above_m(head.xmp),
         altitude_m=altitude_m(head.xmp),
+        is_ellipsoidal=is_ellipsoidal(head.xmp.get((DJI, "AltitudeType"), "")),
         gimbal=angles.attitude,
         gimbal_fault=angles.fault,
         flight=body_angles(head.xmp),

@@ -413,6 +413,54 @@ def test_a_table_outdoes_the_file_but_not_a_picture_that_exif_turns(region, midd
     assert any(line.startswith("clocks disagree: the table is +3600 s (median) off EXIF at 1 of 2") for line in lines)
 
 
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("suffix", ["png", "webp"])
+def test_a_png_or_webp_that_exif_turns_is_treated_as_a_jpeg(suffix, late, region, middle, laid):
+    rows = [row(region, f"a.{suffix}", middle), row(region, "b.png", middle)]
+    request = laid(rows)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    path = request.pictures / f"a.{suffix}"
+    Image.open(path).save(path, exif=exif)
+    if late and suffix == "png":  # the chunk behind the pixels, as some programs write it
+        data = path.read_bytes()
+        at = data.index(b"eXIf") - 4
+        chunk = data[at : at + 12 + int.from_bytes(data[at : at + 4])]
+        data = data.replace(chunk, b"")
+        end = data.index(b"IEND") - 4
+        path.write_bytes(data[:end] + chunk + data[end:])
+    (task,), lines = quiet(request)
+    assert task.manifest.queries == 1
+    assert any(f"(a.{suffix}) that EXIF turns" in line for line in lines)
+
+
+def test_two_pictures_of_one_name_do_not_share_a_row(region, middle, laid):
+    request = laid([row(region, name, middle) for name in ("a.png", "b.png")])
+    for folder in ("may", "june"):
+        (request.pictures / folder).mkdir()
+        (request.pictures / folder / "a.png").write_bytes((request.pictures / "a.png").read_bytes())
+    (request.pictures / "a.png").unlink()
+    (task,), lines = quiet(request)
+    assert task.manifest.queries == 1
+    assert any(
+        "2 pictures (june/a.png, may/a.png) of one name, for which the table has one row" in one for one in lines
+    )
+
+
+def test_a_heading_without_a_pitch_is_of_a_camera_that_looks_straight_down(region, middle, laid):
+    names = ("down.jpg", "bare.jpg", "tilted.jpg")
+    request = laid([row(region, name, middle, angles=(75.0, "", "")) for name in names], without=names)
+    for name, pitch in zip(names, ("-88", None, "-60"), strict=True):
+        told = {"GimbalYawDegree": "30", "GimbalPitchDegree": pitch, "GimbalRollDegree": "0"} if pitch else {}
+        write_photo(request.pictures / name, gps=exif_of(region, middle), xmp=xmp_of(told), size=(WIDTH, HEIGHT))
+    (task,), lines = quiet(request)
+    yaws = sorted(truth.pose.yaw_deg - north_of_grid(region, *middle) for truth in task.truths)
+    assert yaws == pytest.approx([30.0, 75.0, 75.0], abs=0.01)
+    start = "the table has a heading and no pitch: taken as cameras that look straight down"
+    assert f"{start} (2 pictures)" in lines
+    assert any(line.startswith("not used: the table's heading, without a pitch") for line in lines)
+
+
 def test_a_lens_of_a_table_fits_a_smaller_copy_of_its_picture(region, middle, laid):
     """COLMAP's sizes of scaled pictures are rounded, side by side; of another shape it is another picture's."""
     rows = [row(region, name, middle) for name in ("a.png", "b.png")]
@@ -463,8 +511,25 @@ def test_altitudes_above_the_ellipsoid_are_no_heights_above_the_sea(region, midd
     request.poses.write_text(request.poses.read_text().replace("RelativeAltitude", "ellipsoidal_height"))
     with pytest.raises(ConfigError, match="counts from the ellipsoid, where the ground's heights do from the sea"):
         quiet(request)
+    with pytest.raises(ConfigError, match="counts from the ellipsoid"):
+        quiet(replace(request, heights=Heights(takeoff_m=200.0)))
     with pytest.raises(ConfigError, match="does not cover"):
         quiet(laid([row(region, "a.png", middle)], heights=Heights(dem=slope_far(region, middle, tmp_path))))
+
+
+@pytest.mark.parametrize(("kind", "is_refused"), [("RtkAlt", True), ("GpsFusionAlt", False)])
+def test_altitudes_of_rtk_count_from_the_ellipsoid(kind, is_refused, region, middle, towns, tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    told = {"AbsoluteAltitude": "+280.0", "AltitudeType": kind, "RelativeAltitude": "+80.0", "GimbalYawDegree": "0"}
+    told |= {"GimbalPitchDegree": "-90", "GimbalRollDegree": "0"}
+    write_photo(folder / "a.jpg", gps=exif_of(region, middle), xmp=xmp_of(told), focal=24)
+    write_photo(folder / "b.jpg", gps=exif_of(region, middle), xmp=xmp_of(told | {"AltitudeType": "x"}), focal=24)
+    heights = Heights(takeoff_m=200.0)
+    request = ImportRequest(pictures=folder, region=towns / "regions" / TOWN, out=tmp_path / "out", heights=heights)
+    (task,), lines = quiet(request)
+    assert task.manifest.queries == 2 - is_refused
+    assert any("(a.jpg) whose altitude counts from the ellipsoid" in line for line in lines) == is_refused
 
 
 def slope_far(region, middle, folder):

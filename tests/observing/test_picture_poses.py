@@ -131,6 +131,8 @@ def table_of(*names):
         (("a", "b"), "photos/b.tif", "b"),
         (("C:/x/100MEDIA/a.jpg", "C:/x/101MEDIA/a.jpg"), "y/101media/a.jpg", "C:/x/101MEDIA/a.jpg"),
         (("a.jpg",), "c.jpg", None),
+        (("may/a.jpg",), "june/a.jpg", None),
+        (("may/a.jpg",), "a.jpg", "may/a.jpg"),
         (("a.jpg",), "a.tif", None),
     ],
 )

@@ -101,6 +101,12 @@ def test_a_turned_photo_shows_the_same_ground(photo_path, orientation, to_stored
     np.testing.assert_allclose(upright.unproject(corners, Plane()), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("datum", ["WGS-84", "WGS84", "WGS 84", "wgs-84\0", "World Geodetic System 1984", " "])
+def test_wgs_84_is_known_however_it_is_spelt(photo_path, datum):
+    photo = read_photo(write_photo(photo_path, gps=ZURICH | {ExifTags.GPS.GPSMapDatum: datum}))
+    assert (photo.lon_deg, photo.place_fault) == (pytest.approx(8.5), "")
+
+
 def without(*names):
     return {name: value for name, value in POSE.items() if name not in names}
 
@@ -114,6 +120,7 @@ def without(*names):
             "GPS",
         ),
         ({"gps": ZURICH | {ExifTags.GPS.GPSLatitude: (IFDRational(0, 0), 0.0, 0.0)}}, "GPS"),
+        ({"gps": ZURICH | {ExifTags.GPS.GPSMapDatum: "TOKYO"}}, r"a place in another datum than WGS 84 \('TOKYO'\)"),
         ({"xmp": xmp_of(without("RelativeAltitude"))}, "height above take-off missing; give height_m"),
         ({"xmp": xmp_of(without("GimbalPitchDegree"))}, "gimbal angles missing"),
         ({"xmp": xmp_of(POSE | {"GimbalYawDegree": "nan"})}, "gimbal angles missing"),

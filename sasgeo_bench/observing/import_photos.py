@@ -23,7 +23,14 @@ from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.observing.picture_poses import PoseFacts, PoseTable
 from sasgeo_bench.observing.pictures import averaged, list_pictures, names_of, see
 from sasgeo_bench.observing.pose_tables import read_pose_table
-from sasgeo_bench.observing.posed_pictures import Heights, PosedPicture, PosedPictures, lenses_of, pose_pictures
+from sasgeo_bench.observing.posed_pictures import (
+    Heights,
+    PosedPicture,
+    PosedPictures,
+    lenses_of,
+    pose_pictures,
+    reason_of,
+)
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
@@ -164,13 +171,17 @@ def write_tasks(
         place_m = np.array([one.pose.easting_m, one.pose.northing_m])
         if not state.is_mapped(place_m, one.side_m / math.sqrt(2)):  # in any heading
             found.pictures.remove(one)
-            found.left_out[f"whose view is not wholly on the map {state.region}"].append(one.name)
             away.append(one)
+    off_m = [_off_m(one, manifest) for one in away]
+    far = [value for value in off_m if value > 0]
+    nearest = "" if not far else f"{min(far) / 1000:.1f} km" if min(far) >= 1000 else f"{min(far):.0f} m"
+    for one, value in zip(away, off_m, strict=True):
+        beside = f"that were taken {nearest} or more beside the map {state.region}"
+        found.left_out[beside if value > 0 else f"whose view is not wholly on the map {state.region}"].append(one.name)
     _tell(found)
     if not found.pictures:
-        reasons = "; ".join(f"{named(names, 'picture')} {why}" for why, names in found.left_out.items())
         hint = "; longitude and latitude seem to be swapped" if any(_is_swapped(one, manifest) for one in away) else ""
-        raise ConfigError(f"no picture of {request.pictures} can be asked: {reasons}{hint}")
+        raise _nothing(request.pictures, found.left_out, hint)
     writer = TaskWriter(request=request, manifest=manifest, state=state, perceive=perceive)
     tasks = [writer.put(request.name, partial(writer.views, found.pictures), found.pictures)]
     flights = flights_of([one for one in found.pictures if one.name not in writer.failed])
@@ -181,9 +192,22 @@ def write_tasks(
             f"the odometer drifts as {DRIFT} was measured to"
         )
         tasks.append(writer.put(f"{request.name}{FLIGHTS}", partial(writer.flights, flights), flown))
-    for why, names in writer.failed_by.items():
-        tell(f"left out: {named(names, 'picture')} {why}")
+    writer.tell_failed()
     return tuple(tasks)
+
+
+def _nothing(pictures: Path, left_out: Mapping[str, Sequence[str]], hint: str = "") -> ConfigError:
+    """Return the error of pictures none of which can be asked, by the most frequent reason: all have been told."""
+    why = max(left_out, key=lambda why: len(left_out[why]))
+    more = ", the others for the reasons above" if len(left_out) > 1 else ""
+    return ConfigError(f"no picture of {pictures} can be asked: {named(left_out[why], 'picture')} {why}{more}{hint}")
+
+
+def _off_m(one: PosedPicture, manifest: Manifest) -> float:
+    """Return how far beside the map the middle of a view lies, metres; 0 on it."""
+    west, south, east, north = manifest.bounds_m
+    x, y = one.pose.easting_m, one.pose.northing_m
+    return math.hypot(max(west - x, x - east, 0.0), max(south - y, y - north, 0.0))
 
 
 def _posed(request: ImportRequest, epsg: int) -> PosedPictures:
@@ -199,9 +223,20 @@ def table_of(request: ImportRequest) -> PoseTable | None:
         if not facts.names and not facts.times_s:  # a TUM file's pictures: those of the folder, in their order
             facts = replace(facts, names=tuple(names_of(list_pictures(request.pictures), request.pictures)))
         table = read_pose_table(request.poses, facts)
+        given = facts.names
+        if table.kind == "TUM" and not request.facts.names and list(given) != sorted(given, key=_by_number):
+            raise ConfigError(
+                f"{request.poses.name} is for pictures in order, and their names sort another way as text than by "
+                "number (frame_10 before frame_2): pad the numbers of the names with zeros"
+            )
         for line in table.lines():
             tell(line)
     return table
+
+
+def _by_number(name: str) -> list[list[tuple[str, int]]]:
+    parts = (re.findall(r"([^0-9]*)([0-9]*)", part) for part in name.split("/"))
+    return [[(text, int(digits or -1)) for text, digits in part] for part in parts]
 
 
 def _is_swapped(one: PosedPicture, manifest: Manifest) -> bool:
@@ -265,6 +300,11 @@ class TaskWriter:
         """Return the names of pictures that could not be decoded."""
         return {name for names in self.failed_by.values() for name in names}
 
+    def tell_failed(self) -> None:
+        """Tell which pictures could not be decoded, and why."""
+        for why, names in self.failed_by.items():
+            tell(f"left out: {named(names, 'picture')} {why}")
+
     def put(
         self, suite: str, pairs: Callable[[str], Iterator[tuple[Query, Truth]]], of: Sequence[PosedPicture]
     ) -> Task:
@@ -315,8 +355,8 @@ class TaskWriter:
                 count += 1
                 yield pair
         if not count:
-            reasons = "; ".join(f"{named(names, 'picture')} {why}" for why, names in self.failed_by.items())
-            raise ConfigError(f"no picture of {self.request.pictures} can be asked: {reasons}")
+            self.tell_failed()
+            raise _nothing(self.request.pictures, self.failed_by)
 
     def flights(self, flights: Sequence[Sequence[PosedPicture]], suite: str) -> Pairs:
         """Yield the pictures of flights in the order of the ids, with what an odometer says of the way to each."""
@@ -354,7 +394,9 @@ class TaskWriter:
         try:
             seen = self._pictured(one) if self.perceive is None else self.perceive(one)
         except SasgeoError as error:
-            self.failed_by.setdefault(f"that cannot be decoded ({plain(str(error))[:120]})", []).append(one.name)
+            self.failed_by.setdefault(f"that cannot be decoded ({reason_of(error, one.picture.path)})", []).append(
+                one.name
+            )
             return None
         state, group, evidence = self.state, self.request.group, seen.evidence
         height_m = 0.0 if one.picture.camera is None else one.position_m[2]

@@ -239,6 +239,16 @@ def check_crs(epsg: int) -> bool:
     return bool(crs.is_geographic)
 
 
+@lru_cache(maxsize=64)
+def metres_of_unit(epsg: int) -> float:
+    """Return the length of the unit of a projected CRS, metres; 1 if the CRS is geographic, where heights are metres.
+
+    >>> metres_of_unit(32632), round(metres_of_unit(2263), 4)
+    (1.0, 0.3048)
+    """
+    return 1.0 if check_crs(epsg) else float(pyproj.CRS.from_epsg(epsg).axis_info[0].unit_conversion_factor)
+
+
 def convergence_deg(lonlat: Floats, epsg: int) -> Floats:
     """Return the bearing of true north in the grid of a CRS, shape (N, 2) -> (N,), degrees; 0 if it is geographic.
 
@@ -314,7 +324,8 @@ class ModelFrame:
             return []
         if self.origin is None:
             assert self.epsg is not None  # noqa: S101 - one of both is given
-            places, epsg, up_m = position_m[:, :2], self.epsg, position_m[:, 2]
+            # A model is as high in the unit of its CRS as it is wide.
+            places, epsg, up_m = position_m[:, :2], self.epsg, position_m[:, 2] * metres_of_unit(self.epsg)
             lonlat = np.stack(to_lonlat(epsg).transform(*places.T), axis=1)
             turns = [turn_about_up(angle) for angle in convergence_deg(lonlat, epsg).tolist()]
         else:

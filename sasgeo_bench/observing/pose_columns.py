@@ -34,11 +34,12 @@ from sasgeo_bench.observing.picture_poses import (
     attitude_of,
     check_crs,
     convergence_deg,
+    metres_of_unit,
     picture_heading_deg,
     turn_about_up,
 )
 from sasgeo_bench.sensing.camera import Attitude, Intrinsics
-from sasgeo_bench.sensing.photos import DJI, PIX4D, Lens, camera_angles, positive_of
+from sasgeo_bench.sensing.photos import DJI, PIX4D, Lens, camera_angles, datum_fault, is_ellipsoidal, positive_of
 
 MOST_BYTES: Final = 300_000_000  # of a table: reconstructions hold the points of the ground as well
 KNOWN: Final = (
@@ -100,6 +101,8 @@ _NAMES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "ground": ("agl", "height_agl", "alt_agl", "altitude_agl", "above_ground_altitude", "height_above_ground"),
         "sea": ("absolute_altitude", "abs_alt", "gpsaltitude", "gps_altitude", "amsl", "alt_msl", "altitude_msl"),
         "sea_ref": ("gpsaltitude_ref",),
+        "sea_type": ("altitude_type",),
+        "datum": ("gpsmap_datum",),
         "ellipsoid": ("ellipsoidal_height", "ellipsoid_height", "altitude_ellipsoidal", "alt_ellipsoid"),
         "unstated": ("z_est", "altitude", "alt", "z", "z_altitude", "z_height", "elevation", "ele"),
         "gimbal_yaw": ("gimbal_yaw_degree", "gimbal_yaw", "camera_yaw_degree", "camera_yaw"),
@@ -149,9 +152,13 @@ _FIELD_OF: Final = MappingProxyType(
     {key: (name, rank) for name, keys in _NAMES.items() for rank, key in enumerate(keys)}
 )
 _UNKNOWN: Final = frozenset({"", "nan", "null", "none", "na", "n/a", "-", "--", "undef", "inf", "unknown"})
-_NUMBER: Final = re.compile(
-    r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:/([-+]?\d+(?:\.\d+)?))?\s*(?:m|mm|deg|\u00b0|px|pixels)?(?:\s.*)?"
-)
+_NUMBER: Final = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:/([-+]?\d+(?:\.\d+)?))?")
+# A number, its unit, and what exiftool prints after that of an altitude.
+_MEASURED: Final = re.compile(r"(.*[\d.])\s*([A-Za-z]+|\u00b0)(?: (?:above|below) sea level)?", re.IGNORECASE)
+_LENS_UNITS: Final = ("mm", "px", "pixels")
+_RADIANS: Final = (0.02, 3.15)  # of the largest angle of a table that may be in radians; a smaller one is next to none
+# By which two columns of one meaning may differ: degrees of a place, metres of one, degrees of an angle.
+_ALIKE: Final = MappingProxyType({"place": 1e-5, "height": 1.0, "angle": 0.1})
 _MINUTE, _SECOND = "['\u2032\u2019m]", "(?:[\"\u2033\u201ds]|'')"
 _DEGREES: Final = re.compile(  # capitals alone are sides: "s" are seconds
     r"(?P<first>[NSEW])?\s*(?P<sign>[-+])?\s*(?P<deg>\d+(?:\.\d+)?)\s*(?:deg|d|[\u00b0\u00ba])?"
@@ -163,6 +170,8 @@ _MOMENT: Final = re.compile(
     r"(\d{4})[-:/.](\d\d)[-:/.](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:[.,](\d+))?\s*(Z|UTC|GMT|[-+]\d\d:?\d\d)?"
 )
 _PLAIN_UNIT: Final = re.compile(r"[\[(](?:decimal )?(?:degrees?|units?)[\])]", re.IGNORECASE)
+_LETTERS: Final = MappingProxyType({"longitude": "EW", "latitude": "NS"})
+_BODY: Final = ("yaw", "pitch", "roll")
 _NO_PLACE, NO_NUMBER = "without a position", "whose position is no number"
 _NO_SIDE: Final = "whose position does not say N or S, E or W"
 
@@ -172,13 +181,31 @@ def _is_unknown(text: str) -> bool:
 
 
 def number_in(text: str) -> float | None:
-    """Return the number at the start of a cell, which may have a unit; None for anything else, 0/0 included."""
+    """Return the number that a cell is; None for anything else, 0/0 included."""
     match = _NUMBER.fullmatch(text.strip())
     if match is None or "_" in text:
         return None
     below = float(match[2] or 1)
     value = float(match[1]) / below if below else math.nan
     return value if math.isfinite(value) else None
+
+
+def measured_in(text: str, name: str, factor: float) -> float | None:
+    """Return the number of a cell by the unit in it, else times a factor; None where the unit is none of its field's.
+
+    >>> measured_in("100 ft", "sea", 1.0), measured_in("5", "sea", 0.01), measured_in("5 kg", "sea", 1.0)
+    (30.48, 0.05, None)
+    """
+    match = _MEASURED.fullmatch(text.strip())
+    if match is None:
+        value = number_in(text)
+    else:
+        value, unit, quantity = number_in(match[1]), match[2].lower().replace("\u00b0", "deg"), _QUANTITY.get(name)
+        words = WORDS[quantity] if quantity else dict.fromkeys(_LENS_UNITS, "")
+        if unit not in words:
+            return None
+        factor = UNITS[quantity][words[unit]] if quantity else 1.0
+    return None if value is None else value * factor
 
 
 def read_sheet(path: Path, facts: PoseFacts) -> Sheet:
@@ -365,18 +392,31 @@ class _Columns:
         found = self.cell(row, name)
         return found[0] if found else ""
 
-    def number(self, row: Sequence[str], name: str) -> float | None:
+    def number(self, row: Sequence[str], name: str, unstated: float = 1.0) -> float | None:
+        """Return a number in m or degrees; `unstated` is the factor where neither cell nor column has a unit."""
         found = self.cell(row, name)
         if found is None:
             return None
         text, column = found
-        value = number_in(text)
+        value = measured_in(text, name, column.factor or unstated)
         if value is None:
             self.bad[self.sheet.header[column.at]] += not re.fullmatch(r"[-+]?0+/0+", text)
-            return None
-        if column.factor is None and _QUANTITY.get(name) == "height" and re.search(r"\d\s*(?:ft|feet)\b", text):
-            return value * UNITS["height"]["ft"]
-        return value * (column.factor or 1.0)
+        return value
+
+    def plain_numbers(self, column: _Column) -> Iterator[float]:
+        """Yield the cells of a column that are numbers without a unit."""
+        for _, row in self.sheet.rows:
+            value = number_in(row[column.at]) if column.at < len(row) else None
+            if value is not None:
+                yield value
+
+    def value(self, row: Sequence[str], name: str, column: _Column) -> float | None:
+        """Return what one of several columns of a field says of a row; None where that is nothing."""
+        text = row[column.at].strip()
+        if name not in _LETTERS:
+            return measured_in(text, name, column.factor or 1.0)
+        found = _degrees(text, column, self.text(row, f"{name}_ref")[:1].upper(), _LETTERS[name])
+        return None if isinstance(found, str) else found
 
     def title(self, name: str) -> str:
         return plain(self.sheet.header[self.found[name][0].at])
@@ -388,6 +428,9 @@ def poses_of_sheet(path: Path, sheet: Sheet, facts: PoseFacts) -> Read:
     if not columns.has("name"):
         raise PoseError(f"{path.name} has no column that names the pictures: call it file_name")
     is_grid, epsg = _crs_of(columns)
+    unit_m = metres_of_unit(epsg) if is_grid else 1.0
+    _check_units(columns, unit_m)
+    _check_twins(columns)
     zero = _pitch_zero(columns)
     poses: list[PicturePose] = []
     left_out: defaultdict[str, list[str]] = defaultdict(list)
@@ -398,7 +441,7 @@ def poses_of_sheet(path: Path, sheet: Sheet, facts: PoseFacts) -> Read:
         if len(cells) < count or any(cell.strip() for cell in cells[count:]):
             left_out[f"of other than the header's {counted(count, 'cell')}"].append(name or line)
             continue
-        place = _to_grid(columns, row) if is_grid else _place_of(columns, row)
+        place = _to_grid(columns, row, unit_m) if is_grid else _place_of(columns, row)
         if not name:
             left_out["without a name"].append(line)
         elif isinstance(place, str):
@@ -449,12 +492,64 @@ def name_of(text: str) -> str:
     return text.replace("\\", "/").removeprefix("./")
 
 
-def _to_grid(columns: _Columns, row: Sequence[str]) -> tuple[float, float] | str:
+def _check_units(columns: _Columns, unit_m: float) -> None:
+    """Refuse angles that may be in radians, and heights that may be in a CRS's feet or in metres."""
+    path, kind = columns.path, columns.sheet.kind
+    for start, names in (("", ("omega", "phi", "kappa")), ("", _BODY), ("gimbal_", _BODY)):
+        own = [columns.found[start + name][0] for name in names if start + name in columns.found]
+        titles = [plain(columns.sheet.header[column.at]) for column in own]
+        is_stated = any(column.factor for column in own) or any("deg" in title.lower() for title in titles)
+        values = [abs(value) for column in own for value in columns.plain_numbers(column)]
+        low, high = _RADIANS
+        is_free = not kind.startswith(("exiftool", "Metashape"))  # which write degrees
+        if is_free and len(own) == len(names) and not is_stated and low < max(values, default=0.0) <= high:
+            raise PoseError(
+                f"{path.name} has angles in {', '.join(titles)} that may be radians, as none is beyond {high:g}: name "
+                f"the unit in the columns, {titles[0]}_deg or {titles[0]}_rad"
+            )
+    if unit_m == 1.0:
+        return
+    for name, quantity in _QUANTITY.items():
+        for column in columns.found.get(name, ()) if quantity == "height" and name not in ("east", "north") else ():
+            if column.factor is None and next(columns.plain_numbers(column), None) is not None:
+                title = plain(columns.sheet.header[column.at])
+                raise PoseError(
+                    f"{path.name} is in a CRS whose unit is {unit_m:.4f} m, and {title} does not state its own: name "
+                    f"it in the column, {title}_ft or {title}_m"
+                )
+
+
+def _check_twins(columns: _Columns) -> None:
+    """Say which of several columns of one meaning is read; raise `PoseError` if they are of a pose and differ."""
+    sheet = columns.sheet
+    if sheet.kind.startswith(("exiftool", "Metashape")):  # which write several on purpose
+        return
+    for name, found in columns.found.items():
+        first, *others = (plain(sheet.header[one.at]) for one in found)
+        if not others:
+            continue
+        columns.taken[f"{first} is read, and {', '.join(others)} where that is empty"] += 1
+        # Altitudes may be of two receivers, headings of a compass and of a track.
+        quantity = _QUANTITY.get(name, "")
+        is_one = name in ("east", "north") or (quantity in ("place", "angle") and name != "flight_yaw")
+        for line, row in sheet.rows if is_one else ():
+            values = [columns.value(row, name, one) for one in found if one.at < len(row)]
+            known = [value for value in values if value is not None]
+            off = max(known, default=0.0) - min(known, default=0.0)
+            off = min(off, abs(360.0 - off)) if quantity != "height" else off
+            if off > _ALIKE[quantity]:
+                raise PoseError(
+                    f"{columns.path.name} has {first} and {', '.join(others)} of one meaning, which differ ({line}): "
+                    "keep one of them"
+                )
+
+
+def _to_grid(columns: _Columns, row: Sequence[str], unit_m: float) -> tuple[float, float] | str:
     texts = [columns.cell(row, name) for name in ("east", "north")]
     if None in texts:
         return _NO_PLACE
-    east, north = (columns.number(row, name) for name in ("east", "north"))
-    return NO_NUMBER if east is None or north is None else (east, north)
+    east, north = (columns.number(row, name, unit_m) for name in ("east", "north"))
+    return NO_NUMBER if east is None or north is None else (east / unit_m, north / unit_m)
 
 
 def _place_of(columns: _Columns, row: Sequence[str]) -> tuple[float, float] | str:
@@ -466,7 +561,10 @@ def _place_of(columns: _Columns, row: Sequence[str]) -> tuple[float, float] | st
         if len(parts) == 2:
             cells = [(part, _Column(-1, 0, "", None)) for part in reversed(parts)]
     found: list[float] = []
-    for name, letters, cell in zip(("longitude", "latitude"), ("EW", "NS"), cells, strict=True):
+    fault = datum_fault(columns.text(row, "datum")) if columns.facts.epsg is None else ""
+    if fault:
+        return f"with a position {fault}: say --epsg"
+    for (name, letters), cell in zip(_LETTERS.items(), cells, strict=True):
         if cell is None:
             return _NO_PLACE
         value = _degrees(*cell, columns.text(row, f"{name}_ref")[:1].upper(), letters)
@@ -482,7 +580,9 @@ def _degrees(text: str, column: _Column, ref: str, letters: str) -> float | str:
         value = number_in(text)
         return NO_NUMBER if value is None else round(value * column.factor, 12)
     match = _DEGREES.fullmatch(text)
-    if match is None:
+    has_letter = bool(match and (match["first"] or match["last"]))
+    # A comma after bare degrees is XMP's before minutes (8,17.445S), else it may be that of a decimal.
+    if match is None or (re.search(r"\d,", text) and not (has_letter and "." in (match["min"] or ""))):
         return NO_NUMBER
     value = float(match["deg"]) + float(match["min"] or 0) / 60 + float(match["sec"] or 0) / 3600
     side, is_minus = (match["last"] or match["first"] or ref).upper(), match["sign"] == "-"
@@ -571,6 +671,8 @@ def _with_rest(columns: _Columns, row: Sequence[str], pose: PicturePose) -> Pict
     is_below_ref = columns.text(row, "sea_ref").lower().startswith(("below", "1"))
     if altitude_m is not None and altitude_of == "sea" and altitude_m > 0 and (is_below or is_below_ref):
         altitude_m = -altitude_m
+    if altitude_of == "sea" and is_ellipsoidal(columns.text(row, "sea_type")):
+        altitude_of = "ellipsoid"
     spreads = [columns.number(row, name) for name in ("sigma_east", "sigma_north")]
     sigma_m = columns.number(row, "sigma")
     if sigma_m is None and None not in spreads:

@@ -97,8 +97,10 @@ def _read(path: Path, facts: PoseFacts) -> Read:
         return read_metashape(path, facts)
     if start[:1] in (b"{", b"["):
         return _read_json(path, facts)
-    if b"\0" in head:
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise PoseError(f"{path.name} is no text in UTF-8: save it as CSV in UTF-8")
+    if b"\0" in head:
+        raise PoseError(f"{path.name} is no table of poses: name one ({KNOWN})")
     lines = start.decode("utf-8", errors="replace").splitlines()
     line = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     if is_colmap(line) or any(one.startswith("# Image list with two lines of data") for one in lines[:20]):

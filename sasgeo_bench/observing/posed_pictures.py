@@ -312,7 +312,7 @@ def _photo(path: Path) -> tuple[Photo, float | None]:
             with Image.open(BytesIO(data), formats=("PNG", "WEBP")) as image:
                 # Pillow decodes a PNG to look for EXIF behind its pixels.
                 exif = image.getexif() if "exif" in image.info or b"exif" in data.lower() else {}
-                turned = {ExifTags.Base.Orientation: exif.get(ExifTags.Base.Orientation, 1)}
+                turned: Mapping[int, int] = {ExifTags.Base.Orientation: exif.get(ExifTags.Base.Orientation, 1)}
                 head = PhotoHead(size_px=image.size, exif=turned, inner={}, gps={}, xmp={})
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # SyntaxError: Pillow's
             raise ImageError(f"{path.name} is no sound picture: copy it again") from error

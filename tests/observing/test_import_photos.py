@@ -316,6 +316,7 @@ def test_pictures_without_a_pose_are_left_out_and_counted(region, middle, laid):
         row(region, "tilted.png", middle, angles=(0.0, -25.0, 0.0)),
         row(region, "low.png", middle, height=-3),
         row(region, "off.png", offset(middle, 900, 0)),
+        row(region, "edge.png", offset(middle, 500, 0)),
         row(region, "bare.png", middle, angles=("", "", "")),
         row(region, "broken.png", middle),
         row(region, "tiny.png", middle, height=5),
@@ -331,7 +332,9 @@ def test_pictures_without_a_pose_are_left_out_and_counted(region, middle, laid):
     assert "left out: 2 pictures (none.jpg, stray.png) that the table does not name" in told
     assert "left out: 1 picture (tilted.png) that look more than 60 degrees away from straight down" in told
     assert "left out: 1 picture (low.png) that were not above the ground" in told
-    assert "left out: 1 picture (off.png) whose view is not wholly on the map town-riverside" in told
+    assert "left out: 1 picture (edge.png) whose view is not wholly on the map town-riverside" in told
+    off_m = middle[0] + 900 - region.grid.bounds_m[2]
+    assert f"left out: 1 picture (off.png) that were taken {off_m:.0f} m or more beside the map town" in told
     assert "left out: 1 picture (bare.png) without angles of the camera" in told
     assert "left out: 1 picture (tiny.png) that show less ground than 16 m a side" in told
     assert "left out: 1 picture (broken.png) that cannot be decoded" in told
@@ -566,13 +569,45 @@ def test_heights_have_one_source():
 
 
 def test_nothing_is_written_where_no_picture_is_left(region, middle, laid, tmp_path):
-    with pytest.raises(ConfigError, match=r"1 picture \(a\.png\) whose view is not wholly on the map"):
+    with pytest.raises(ConfigError, match=r"1 picture \(a\.png\) that were taken 4\.5 km or more beside the map"):
         quiet(laid([row(region, "a.png", offset(middle, 5000, 0))]))
-    request = laid([row(region, "a.png", middle)])
-    (request.pictures / "a.png").write_bytes((request.pictures / "a.png").read_bytes()[:3000])
-    with pytest.raises(ConfigError, match="cannot be decoded"):
-        quiet(request)
+    request = laid([row(region, name, middle) for name in ("a.png", "b.png")])
+    for name in ("a.png", "b.png"):  # of one size: like faults are counted together
+        (request.pictures / name).write_bytes((request.pictures / "a.png").read_bytes()[:3000])
+    lines = []
+    with reporting(lines.append), pytest.raises(ConfigError, match=r"2 pictures \(.*\) that cannot be decoded"):
+        import_photos(request)
+    assert sum("cannot be decoded" in line for line in lines) == 1
+    assert "it is truncated" in lines[-1]
     assert not list((tmp_path / "out").rglob("*.parquet"))
+
+
+def test_the_most_frequent_reason_stands_for_those_that_were_told(region, middle, laid):
+    far = [row(region, name, offset(middle, 5000, 0)) for name in ("a.png", "b.png")]
+    rows = [*far, row(region, "c.png", middle, height=-3)]
+    with pytest.raises(ConfigError, match=r"2 pictures .* beside the map town-riverside, the others for the") as caught:
+        quiet(laid(rows))
+    assert "above the ground" not in str(caught.value)
+
+
+def test_a_fault_of_a_file_is_told_without_its_folders(region, middle, laid):
+    request = laid([row(region, "a.png", middle), row(region, "bad/junk/b.jpg", middle)], without=["bad/junk/b.jpg"])
+    (request.pictures / "bad" / "junk").mkdir(parents=True)
+    (request.pictures / "bad" / "junk" / "b.jpg").write_text("no picture")
+    _, lines = quiet(request)
+    assert any("that cannot be read (it is no JPEG" in line for line in lines)
+
+
+def test_a_tum_file_is_refused_where_names_sort_by_text_and_not_by_number(region, middle, laid):
+    lon, lat = lonlat(region, *middle)
+    names = [f"frame_{at}.png" for at in (1, 2, 10)]
+    request = laid([row(region, name, middle) for name in names])
+    request.poses.write_text("".join(f"{at} {10 * at} 0 80 1 0 0 0\n" for at in (5, 6, 7)))
+    facts = PoseFacts(origin=(lon, lat, 0.0))
+    with pytest.raises(ConfigError, match="pad the numbers of the names with zeros"):
+        quiet(replace(request, facts=facts))
+    with pytest.raises(ConfigError, match="focal length"):  # pictures of noise have no lens: the poses were taken
+        quiet(replace(request, facts=replace(facts, names=tuple(names))))
 
 
 def test_the_command_prints_the_folders_of_its_tasks(region, middle, laid, program):

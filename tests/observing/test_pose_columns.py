@@ -69,6 +69,8 @@ FAULTS = [
     ("8 deg 77' 26.70\" S", "115.46", "whose position is no number"),
     ("north", "115.46", "whose position is no number"),
     ("8,2907 S", "115.46", "whose position is no number"),
+    ("8,05 S", "115.46", "whose position is no number"),
+    ("-8,05", "115.46", "whose position is no number"),
     ("115.46 E", "8.29 S", "whose longitude and latitude are swapped"),
     ("115.46", "-8.29", "whose longitude and latitude are swapped"),
     ("-8.29 N", "115.46", "whose position has a sign and a letter that contradict each other"),
@@ -194,6 +196,41 @@ def test_pitches_that_count_from_elsewhere_are_left_out(read):
     assert table.poses[0].attitude.pitch_deg == -80.0
 
 
+def test_angles_in_the_unit_that_a_cell_or_a_column_states(read):
+    angles = "1.5707963267948966 rad,-80 deg,0\u00b0"
+    assert one(read, "gimbal_yaw,gimbal_pitch,gimbal_roll", angles).attitude == Attitude(pitch_deg=-80.0, yaw_deg=90.0)
+    stated = [
+        one(read, ",".join(f"{name}_{unit}" for name in ("omega", "phi", "kappa")), row).attitude.matrix
+        for unit, row in (("deg", "1,2,3"), ("rad", ",".join(str(np.radians(value)) for value in (1, 2, 3))))
+    ]
+    np.testing.assert_allclose(*stated, atol=1e-9)
+
+
+def test_of_columns_of_one_meaning_the_one_that_is_read_is_said(read):
+    table = read("file,lat,latitude,lon\na.jpg,-8.29,-8.290001,115.46\nb.jpg,-8.28,,115.46\n")
+    assert [pose.place[1] for pose in table.poses] == [-8.290001, -8.28]
+    assert "latitude is read, and lat where that is empty" in table.notes
+
+
+def test_a_decimal_comma_is_no_separator_of_minutes(read):
+    table = read('file,lat,lat_ref,lon\na.jpg,"48,05",N,9.0\nb.jpg,48.05,N,9.0\n')
+    assert reasons(table) == {"whose position is no number": {"a.jpg"}}
+
+
+def test_a_place_in_another_datum_is_none_unless_the_user_says_which(read):
+    content = "file,lat,lon,GPSMapDatum\na.jpg,35.0,139.0,TOKYO\nb.jpg,35.0,139.0,WGS-84\n"
+    assert reasons(read(content)) == {"with a position in another datum than WGS 84 ('TOKYO'): say --epsg": {"a.jpg"}}
+    assert len(read(content, epsg=4301).poses) == 2
+
+
+def test_a_crs_in_feet_has_eastings_in_feet_and_heights_in_what_they_state(read):
+    (pose,) = read("file,x,y,z_ft\na.jpg,980000,200000,300\n", epsg=2263).poses
+    (same,) = read("file,x_m,y_m,z_m\na.jpg,298704.5974,60960.1219,91.44\n", epsg=2263).poses
+    assert pose.altitude_m == pytest.approx(91.44)
+    assert same.place == pytest.approx(pose.place, abs=1e-3)
+    assert pose.lonlat == pytest.approx((-74.0158, 40.7156), abs=1e-3)
+
+
 def test_a_heading_against_magnetic_north_is_not_read(read):
     header = f"SourceFile,GPSLongitude,GPSLatitude,GPSImgDirection,GPSImgDirectionRef\na.jpg,{PLACE},90,"
     assert read(header + "True North\n").poses[0].heading_deg == 90.0
@@ -215,6 +252,12 @@ def test_a_heading_against_magnetic_north_is_not_read(read):
         ("ellipsoidal_height_m", "250.5", None, (250.5, "ellipsoid")),
         ("altitude [m]", "250.5", None, (250.5, "unstated")),
         ("altitude", "820.2 ft", None, (820.2 * 0.3048, "unstated")),
+        ("altitude_ft", "820.2 m", None, (820.2, "unstated")),
+        ("altitude", "10000 cm", None, (100.0, "unstated")),
+        ("altitude", "10000 kg", None, None),
+        ("altitude", "100 m or so", None, None),
+        ("AbsoluteAltitude,AltitudeType", "+198.61,RtkAlt", None, (198.61, "ellipsoid")),
+        ("AbsoluteAltitude,AltitudeType", "+198.61,GpsFusionAlt", None, (198.61, "sea")),
         ("GPSAltitude", "undef", None, None),
         ("GPSAltitude", "0/0", None, None),
         ("GPSAltitude", "3721/10", None, (372.1, "sea")),

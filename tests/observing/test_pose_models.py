@@ -200,6 +200,14 @@ def test_a_mirrored_camera_of_metashape_is_no_pose(lay):
     assert table.left_out == {"whose rotation is none": (NAMES[0],)}
 
 
+def test_a_model_in_a_crs_in_feet_is_high_in_feet_too(tmp_path):
+    path = tmp_path / "images.txt"
+    path.write_text("1 0 1 0 0 -980000 200000 300 1 a.jpg\n\n")  # it looks down: x, -y, -z
+    (pose,) = read_pose_table(path, PoseFacts(epsg=2263)).poses
+    assert pose.place == pytest.approx((980000.0, 200000.0))
+    assert pose.altitude_m == pytest.approx(300 * 1200 / 3937)  # of US survey feet
+
+
 def test_a_chunk_without_aligned_cameras_has_what_was_measured(lay):
     told = '<reference x="115.46" y="-8.29" z="200" yaw="90" pitch="10" roll="0" sx="0.02" sy="0.03" enabled="true"/>'
     text = cameras.metashape()

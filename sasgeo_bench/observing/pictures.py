@@ -38,7 +38,7 @@ FINEST_M: Final = 0.25  # pixels on the ground; finer ones are averaged
 STEEPEST_DEG: Final = 60.0  # of tilt: beyond it the ground of a view is far and coarse
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
 MOST_BYTES: Final = 2**30  # of a georeferenced picture: windows of it are read
-_MOST_PHOTO_BYTES: Final = 64 * 2**20
+MOST_PHOTO_BYTES: Final = 64 * 2**20
 _FINE_M: Final = 128.0  # widest view in cells of `_CELLS_M[0]`, as in the suites
 _CELLS_M: Final = (0.5, 1.0)
 _MARGIN: Final = 1.25  # times the view's side is what is cut out of a picture
@@ -200,7 +200,7 @@ def open_picture(path: Path, told: Told | None = None) -> OwnPicture:
         return found
     if path.suffix.lower() in (".png", ".webp"):  # without metadata of a drone that anybody writes
         return _plain(path, told)
-    return _of_photo(path, read_photo(path, most_bytes=_MOST_PHOTO_BYTES), told)
+    return _of_photo(path, read_photo(path, most_bytes=MOST_PHOTO_BYTES), told)
 
 
 def _plain(path: Path, told: Told) -> OwnPicture:
@@ -347,7 +347,7 @@ def see(picture: OwnPicture, told: Told | None = None) -> Sight:
     if picture.camera is None and picture.position_by == "georeference":
         return _seen_from_above(*_read_georeferenced(picture))
     name = picture.path.name
-    rgb = decode_image(read_bounded(picture.path, _MOST_PHOTO_BYTES), name=name)
+    rgb = decode_image(read_bounded(picture.path, MOST_PHOTO_BYTES), name=name)
     if picture.camera is None:
         assert told.ground_width_m is not None  # noqa: S101 - by `open_picture`
         gsd_m = told.ground_width_m / rgb.shape[1]

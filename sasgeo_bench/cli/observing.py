@@ -13,7 +13,7 @@ import typer
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress
 from sasgeo_bench.cli.options import Options, Out, takes
-from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.errors import ConfigError, counted, named
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.observing.locate import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
@@ -106,7 +106,8 @@ def locate(options: LocateOptions) -> Located:
     found = located_by(request, lambda region: Strips(into, region))
     for fix in found.fixes:
         options.say(line_of(fix))
-    for note in (found.calibration, *notes_of(found.fixes)):
+    answered = [found.calibration] if any(fix.p_false is not None for fix in found.fixes) else []
+    for note in (*answered, *notes_of(found.fixes)):
         tell(note)
     write_results(found)
     return found
@@ -120,7 +121,7 @@ def line_of(fix: Fix) -> str:
     """
     words: list[str] = [fix.status]
     if fix.lon is not None and fix.heading_deg is not None:
-        words.append(f"{fix.lon:.6f},{fix.lat:.6f} ({fix.x_m:.0f} m east, {fix.y_m:.0f} m north)")
+        words.append(f"lon,lat {fix.lon:.6f},{fix.lat:.6f} ({fix.x_m:.0f} m east, {fix.y_m:.0f} m north)")
         words.append(f"heading {fix.heading_deg:.0f} deg")
     if fix.p_false is not None:
         words.append(f"P(false fix) {fix.p_false:.3f}")
@@ -147,6 +148,8 @@ def locate_command(options: LocateOptions) -> None:
         found = locate(**vars(options) | {"say": lines.append})
     for line in lines:
         say(line)
+    counts = Counter(fix.status for fix in found.fixes)
+    say(", ".join(f"{count} {status}" for status, count in counts.most_common()))
     say(found.request.into / PAGE)
     failed = sum(fix.status == "failed" for fix in found.fixes)
     if failed:
@@ -162,8 +165,13 @@ def _name_of(pictures: Path) -> str:
 
 
 def _region(name: str, out: Path) -> Path:
-    folder = Path(name)
-    return folder if (folder / "region.json").is_file() else out / "regions" / name
+    """Return the folder of a built region; raise `ConfigError`, which lists those that are built, if there is none."""
+    for folder in (Path(name), out / "regions" / name):
+        if (folder / "region.json").is_file():
+            return folder
+    built = sorted(file.parent.name for file in (out / "regions").glob("*/region.json"))
+    there = f"built are {named(built, 'region', most=8)}" if built else "build one with build-region"
+    raise ConfigError(f"no region {name!r} is built in {out / 'regions'}: {there}")
 
 
 def _lonlat(text: str) -> tuple[float, float]:

@@ -67,8 +67,8 @@ class Answers(JsonDocument):
         """Return on what P(false fix) was calibrated, in a line."""
         places = ", ".join(self.places)
         return (
-            f"calibrated on {len(self.rows)} answers of {self.matcher} to pictures of {places}, seen by {self.asked}, "
-            "which none of them taught"
+            f"calibrated on {len(self.rows)} answers of {self.matcher} to real pictures of {places}, places from which "
+            f"{self.asked} had not learned"
         )
 
 

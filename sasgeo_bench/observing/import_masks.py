@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Masks and probabilities of somebody else's network as tasks: evidence that every matcher reads."""
 
-import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError
+from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError, named
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
@@ -17,7 +17,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.import_photos import ImportRequest, Perceived, table_of, view_cells, write_tasks
 from sasgeo_bench.observing.masks import MASKS, Legend, Strange, read_coco, read_mask
-from sasgeo_bench.observing.pictures import LEAST_M, WIDEST_M, largest_square, open_picture
+from sasgeo_bench.observing.pictures import LEAST_M, WIDEST_M, OwnPicture, largest_square, open_picture
 from sasgeo_bench.observing.posed_pictures import (
     GPS_SIGMA_M,
     PosedPicture,
@@ -30,6 +30,7 @@ from sasgeo_bench.sensing.birdseye import to_evidence
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import AerialImage
+from sasgeo_bench.sensing.photos import read_photo
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.frame_evidence import for_classes
 from sasgeo_bench.tasks.suites.pictures import unseen
@@ -70,19 +71,22 @@ def import_masks(request: MaskRequest) -> tuple[Task, ...]:
         found = pose_pictures(
             photos.pictures, table_of(photos), epsg=manifest.epsg, heights=photos.heights, sigma_m=photos.sigma_m
         )
+    users = Counter(_key(one.name) for one in found.pictures)
     for one in list(found.pictures):
-        if not given.has(one.name):
+        why = "" if given.has(one.name) else f"without a mask of their name (there is {given.shown})"
+        why = why or ("that share a mask with another picture" if users[_key(one.name)] > 1 else "")
+        if why:
             found.pictures.remove(one)
-            found.left_out["without a mask of their name"].append(one.name)
+            found.left_out[why].append(one.name)
+    _tell_turned(found)
 
     def perceive(one: PosedPicture) -> Perceived:
         """Return the evidence of a mask under the camera of its picture, for the classes of the map."""
         seen = given.read(one.name)
         rows, cols = seen.shape
         if one.picture.camera is None:
-            image_camera = AerialImage.from_above(
-                np.zeros((rows, cols, 3), dtype=np.uint8), gsd_m=one.picture.gsd_m or math.nan
-            ).camera
+            gsd_m = square_pixel_m(one.picture, rows, cols)
+            image_camera = AerialImage.from_above(np.zeros((rows, cols, 3), dtype=np.uint8), gsd_m=gsd_m).camera
         else:
             image_camera = scaled(one.picture.camera, rows, cols, plain(one.name))
         middle_m, side_m = largest_square(image_camera.footprint(Plane()))
@@ -99,6 +103,32 @@ def import_masks(request: MaskRequest) -> tuple[Task, ...]:
     if strange.note():
         tell(strange.note())
     return made
+
+
+def _tell_turned(found: PosedPictures) -> None:
+    """Say of how many photos EXIF turns what is stored: their masks may be of either."""
+    turned = []
+    for one in found.pictures:
+        if one.picture.camera is not None and one.picture.path.suffix.lower() in (".jpg", ".jpeg"):
+            turned += [one.name] if read_photo(one.picture.path).orientation != 1 else []
+    if turned:
+        tell(f"{named(turned, 'photo')} turned by EXIF: masks are taken as upright, as such a photo is shown")
+
+
+def square_pixel_m(picture: OwnPicture, rows: int, cols: int) -> float:
+    """Return the width of a pixel of a mask of a georeferenced picture; raise `ImageError` if it is not square."""
+    assert picture.size_m is not None  # noqa: S101 - it is georeferenced
+    with open_geotiff(picture.path) as source:
+        if source.transform.determinant > 0:
+            raise ImageError(f"{picture.path.name} is stored mirrored, such as south-up: warp it (gdalwarp -r near)")
+        shape = source.shape
+    across_m, down_m = picture.size_m[0] / cols, picture.size_m[1] / rows
+    if abs(across_m / down_m - 1) > _SQUARE:
+        words = f"has pixels of {across_m:.2f} x {down_m:.2f} m"
+        if (rows, cols) != shape:
+            words += f", its picture {shape[1]} x {shape[0]} of them"
+        raise ImageError(f"{picture.path.name} {words}: warp it to a projected CRS (gdalwarp -r near)")
+    return across_m
 
 
 def scaled(camera: Camera, rows: int, cols: int, name: str) -> Camera:
@@ -142,7 +172,12 @@ class _Masks:
     def of(cls, request: MaskRequest, strange: Strange) -> "_Masks":
         path, legend = request.masks, request.legend
         if path.is_file() and path.suffix.lower() == ".json":
-            return cls(legend=legend, strange=strange, files={}, coco={_key(n): s for n, s in read_coco(path, legend)})
+            coco: dict[str, Segmentation] = {}
+            for name, seen in read_coco(path, legend):
+                if _key(name) in coco:
+                    raise ConfigError(f"{path.name} names {plain(name)} and another picture of that name: rename one")
+                coco[_key(name)] = seen
+            return cls(legend=legend, strange=strange, files={}, coco=coco)
         if not path.is_dir():
             raise ConfigError(f"{path} is no folder of masks, nor a COCO file (*.json): check the path")
         files: dict[str, Path] = {}
@@ -153,6 +188,11 @@ class _Masks:
         if not files:
             raise ConfigError(f"{path} holds no mask ({', '.join(MASKS)}): name a folder that does")
         return cls(legend=legend, strange=strange, files=files, coco={})
+
+    @property
+    def shown(self) -> str:
+        """Return the first of the masks, by name."""
+        return plain(next(iter([*self.coco, *(path.name for path in self.files.values())]), "none"))
 
     def has(self, name: str) -> bool:
         return _key(name) in self.files or _key(name) in self.coco
@@ -192,17 +232,11 @@ def _georeferenced(path: Path, name: str, epsg: int, sigma_m: float | None) -> P
         raise ImageError(f"{path.name} is not georeferenced: name its photos with --photos, or a table with --poses")
     picture = open_picture(path)
     assert picture.lonlat is not None  # noqa: S101 - by its georeference
-    assert picture.gsd_m is not None  # noqa: S101 - as above
-    assert picture.size_m is not None  # noqa: S101 - as above
     with open_geotiff(path) as source:
         rows, cols = source.shape
-    across_m, down_m = picture.size_m[0] / cols, picture.size_m[1] / rows
-    if abs(across_m / down_m - 1) > _SQUARE:
-        raise CameraError(
-            f"{path.name} has pixels of {across_m:.2f} x {down_m:.2f} m: warp it to a projected CRS (gdalwarp -r near)"
-        )
+    gsd_m = square_pixel_m(picture, rows, cols)
     east_m, north_m, convergence_deg = to_grid(*picture.lonlat, epsg)
-    side_m = min(WIDEST_M, min(rows, cols) * picture.gsd_m)
+    side_m = min(WIDEST_M, min(rows, cols) * gsd_m)
     if side_m < LEAST_M:
         raise CameraError(f"{path.name} shows a square of {side_m:.0f} m, a view has at least {LEAST_M:g} m")
     return PosedPicture(
@@ -214,5 +248,5 @@ def _georeferenced(path: Path, name: str, epsg: int, sigma_m: float | None) -> P
         sigma_m=GPS_SIGMA_M if sigma_m is None else sigma_m,
         position_m=(east_m, north_m, 0.0),
         side_m=side_m,
-        lens=f"georeferenced, pixels of {picture.gsd_m:.2f} m",
+        lens=f"georeferenced, pixels of {gsd_m:.2f} m",
     )

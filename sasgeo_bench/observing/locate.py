@@ -15,7 +15,7 @@ import numpy as np
 
 from sasgeo_bench.core import progress
 from sasgeo_bench.core.errors import ConfigError, MatchError, SasgeoError, StoreError, counted
-from sasgeo_bench.core.folders import locked
+from sasgeo_bench.core.folders import locked, sha256_of
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
@@ -25,6 +25,7 @@ from sasgeo_bench.matching.matcher import MatcherCard, Prediction, lacks
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.observing.chances import Answers, Chances, answers_for
 from sasgeo_bench.observing.pictures import (
+    MOST_PHOTO_BYTES,
     OwnPicture,
     Sight,
     Told,
@@ -110,6 +111,8 @@ class LocateRequest:
     def __post_init__(self) -> None:
         if not 10.0 <= self.radius_m <= 100_000.0:
             raise ConfigError(f"--radius lies within 10 and 100000 m, got {self.radius_m!r}")
+        if self.heading is not None and not -180 <= self.heading[0] <= 360:
+            raise ConfigError(f"--heading lies within -180 and 360 degrees, got {self.heading[0]:g}")
         if not 0 < self.most_false < 1:
             raise ConfigError(f"--most-false lies between 0 and 1, got {self.most_false!r}")
         if self.near is not None and not (abs(self.near[0]) <= 180 and abs(self.near[1]) <= 84):  # UTM ends there
@@ -146,6 +149,7 @@ class Fix:
     taken_at: str | None = None
     note: str = ""
     view: tuple[float, float, float, float] | None = None  # easting, northing, yaw and scale of the view's middle
+    key: str = ""  # of all that the answer follows from
 
     @property
     def view_pose(self) -> Pose | None:
@@ -188,7 +192,7 @@ class Watch:
     def seen(self, number: int, seen: Seen) -> None:
         """Take a picture with its evidence."""
 
-    def is_shown(self, number: int) -> bool:  # noqa: ARG002
+    def is_shown(self, number: int, fix: Fix) -> bool:  # noqa: ARG002
         """Return whether a picture was taken by an earlier call already."""
         return True
 
@@ -222,11 +226,12 @@ def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = No
         label = "pictures located"
         progress.begin(label, len(paths))
         with (request.into / ANSWERS).open("a", encoding="utf-8") as file:
+            file.write("\n")  # a line that was cut off ends here
             for number, (path, name) in enumerate(zip(paths, names, strict=True)):
                 key = asker.key(path, name)
                 fix = kept.get(key)
-                if fix is None or (watch is not None and not watch.is_shown(number) and fix.view is not None):
-                    seen = asker.ask(path, name)
+                if fix is None or (watch is not None and not watch.is_shown(number, fix) and fix.view is not None):
+                    seen = asker.ask(path, name, key)
                     fix = seen if isinstance(seen, Fix) else seen.fix
                     if watch is not None and isinstance(seen, Seen):
                         watch.seen(number, seen)
@@ -261,18 +266,8 @@ def _kept(path: Path) -> dict[str, Fix]:
 
 def _region_of(request: LocateRequest, paths: Sequence[Path]) -> Path:
     """Return the newest built region that holds the place of the search, and say which."""
-    place, of = request.near, "--near"
-    if place is None and request.uses_position:
-        for path in paths:
-            try:
-                place, of = open_picture(path, request.told).lonlat, path.name
-            except SasgeoError:
-                continue
-            if place is not None:
-                break
-    if place is None:
-        raise ConfigError("no picture says where it was taken: name a region with --region, or a place with --near")
-    found = []
+    place, of = _place_of(request, paths)
+    found, is_swapped = [], False
     for file in sorted((request.out / "regions").glob("*/region.json")):
         try:
             manifest = read_manifest(file.parent)
@@ -280,14 +275,38 @@ def _region_of(request: LocateRequest, paths: Sequence[Path]) -> Path:
             continue
         if "+" not in file.parent.name and _holds(manifest, place):
             found.append((manifest.extract.date, -math.prod(manifest.grid.shape), file.parent))
+        is_swapped = is_swapped or _holds(manifest, place[::-1])
     if not found:
+        where = f"{place[0]:.5f},{place[1]:.5f} ({of})"
+        if is_swapped:
+            raise ConfigError(
+                f"no built region holds {where}, one holds it with the two swapped: longitude comes first"
+            )
         raise ConfigError(
-            f"no built region in {request.out / 'regions'} holds {place[0]:.5f},{place[1]:.5f} ({of}): make one with "
-            f"new-region NAME --center {place[0]:.5f},{place[1]:.5f} --size 2km, and build it"
+            f"no built region in {request.out / 'regions'} holds {where}: make one with new-region NAME --center "
+            f"{place[0]:.5f},{place[1]:.5f} --size 2km (or --photos FOLDER) --extracts FOLDER, and build it"
         )
     folder = max(found)[2]
     tell(f"map: {folder.name}, the newest that holds {of}")
     return folder
+
+
+def _place_of(request: LocateRequest, paths: Sequence[Path]) -> tuple[tuple[float, float], str]:
+    """Return longitude and latitude by which a map is chosen, and whose they are."""
+    if request.near is not None:
+        return request.near, "--near"
+    fault = ""
+    for path in paths if request.uses_position else ():
+        try:
+            lonlat = open_picture(path, request.told).lonlat
+        except SasgeoError as error:
+            fault = fault or str(error)
+            continue
+        if lonlat is not None:
+            return lonlat, path.name
+    raise ConfigError(
+        fault or "no picture says where it was taken: name a region with --region, or a place with --near"
+    )
 
 
 def _holds(manifest: Manifest, place: tuple[float, float]) -> bool:
@@ -366,7 +385,8 @@ class _Asker:
         """Return on which pictures P(false fix) was calibrated, in a line."""
         answers = self._answers()
         if answers is not None:
-            return f"P(false fix) is {answers.text}"
+            here = any(self._region.name.startswith(place) for place in answers.places)
+            return f"P(false fix) is {answers.text}" + ("; this place is among them" if here else "")
         return (
             f"P(false fix) is not calibrated for {self._request.matcher} with {self._request.segmenter}: nothing is "
             "accepted"
@@ -376,12 +396,10 @@ class _Asker:
         """Return the hash of all that an answer follows from."""
         request = self._request
         codes = self._codes.result()
-        stat = path.stat()
         asked = [
             _VERSION,
             name,
-            stat.st_size,
-            stat.st_mtime_ns,
+            _content(path),
             *codes,
             {item: record.sha256 for item, record in self._manifest.files.items()},
             request.near,
@@ -394,7 +412,7 @@ class _Asker:
         ]
         return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:32]
 
-    def ask(self, path: Path, name: str) -> Seen | Fix:
+    def ask(self, path: Path, name: str, key: str) -> Seen | Fix:
         """Locate one picture; a fault of the picture is a row."""
         begun = time.perf_counter()
         try:
@@ -414,7 +432,10 @@ class _Asker:
         answer = self._answer(query)
         fix = self._fix(picture, sight, query, answer, name, centre)
         return Seen(
-            fix=replace(fix, seconds=_since(begun)), sight=sight, segmentation=reply.found, evidence=query.evidence
+            fix=replace(fix, key=key, seconds=_since(begun)),
+            sight=sight,
+            segmentation=reply.found,
+            evidence=query.evidence,
         )
 
     def _prior(self, picture: OwnPicture, name: str) -> tuple[Prior, tuple[float, float] | None]:
@@ -593,6 +614,14 @@ def _evidence_of(sight: Sight, seen: Segmentation) -> Evidence:
         cell_size_m=sight.cell_size_m,
         pose=sight.pose,
     )
+
+
+def _content(path: Path) -> str:
+    """Return what tells the content of a file: its hash, of a mosaic its size and when it last changed."""
+    about = path.stat()
+    if about.st_size <= MOST_PHOTO_BYTES:
+        return sha256_of(path)
+    return f"{about.st_size} {about.st_mtime_ns} {about.st_ctime_ns}"
 
 
 def _middle(manifest: Manifest) -> tuple[float, float]:

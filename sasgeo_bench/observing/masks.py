@@ -33,10 +33,12 @@ NONE: Final = "none"  # of a legend: nothing of any class that it names is there
 UNKNOWN: Final = "unknown"
 MOST_PIXELS: Final = 64_000_000
 _MOST_BYTES: Final = 2**30
-_MOST_STRANGE: Final = 0.5  # of the pixels: of more, the legend is of other masks
+_MOST_STRANGE: Final = 0.5  # of the pixels that are not background: of more, the legend is of other masks
 _COLOUR: Final = re.compile(r"#[0-9a-f]{6}")
 _VALUE: Final = re.compile(r"[0-9]{1,5}")
 _SHOWN: Final = 6
+_MOST_VALUE: Final = 65535
+_FEW: Final = 32  # an 8-bit plane that holds no more than this holds values of classes, not chances
 
 Classes = Annotated[list[str], Field(min_length=1)]
 Meaning = str | Classes
@@ -65,10 +67,23 @@ class Legend(Document):
     @field_validator("values")
     @classmethod
     def _are_numbers(cls, given: dict[str, Meaning]) -> dict[str, Meaning]:
-        strange = next((key for key in given if not _VALUE.fullmatch(key)), None)
+        strange = next((key for key in given if not _VALUE.fullmatch(key) or int(key) > _MOST_VALUE), None)
         if strange is not None:
-            raise ValueError(f"values are whole numbers from 0 to 65535, got {strange!r}")
-        return {str(int(key)): meaning for key, meaning in given.items()}
+            raise ValueError(f"values are whole numbers from 0 to {_MOST_VALUE}, got {strange!r}")
+        found = {str(int(key)): meaning for key, meaning in given.items()}
+        if len(found) < len(given):
+            raise ValueError(f"a value stands there twice, as in '1' and '01': {', '.join(given)}")
+        return found
+
+    @field_validator("bands")
+    @classmethod
+    def _are_bands_of_a_class_each(cls, given: dict[str, str]) -> dict[str, str]:
+        if "0" in given:
+            raise ValueError("bands are counted from 1, got '0'")
+        twice = next((name for name in given.values() if list(given.values()).count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"{twice!r} is from two bands: put their chances together first (the larger of both)")
+        return given
 
     @field_validator("colours")
     @classmethod
@@ -165,7 +180,7 @@ def read_mask(path: Path, legend: Legend, strange: Strange | None = None) -> Seg
     Raises
     ------
     ImageError
-        If the file is no mask, most of it is not in the legend, or probabilities lie beyond 0..1.
+        If the file is no mask, most of what it shows is not in the legend, or probabilities lie beyond 0..1.
 
     Examples
     --------
@@ -226,7 +241,8 @@ def _of_values(
         known[int(nodata)] = True  # unknown by the file's own word, unless the legend says otherwise
     there, counts = np.unique(values, return_counts=True)
     missing = {str(value): int(count) for value, count in zip(there, counts, strict=True) if not known[value]}
-    _note(path, missing, int(values.size), legend.values, strange)
+    zero = [int(key) for key, meaning in legend.values.items() if meaning in (NONE, UNKNOWN)]
+    _note(path, missing, int(values.size), int(np.isin(values, zero).sum()), legend.values, strange)
     return Segmentation(classes=legend.classes, probability_bytes=np.moveaxis(table[values], -1, 0).copy())
 
 
@@ -250,17 +266,19 @@ def _of_colours(
         known |= here
     there, counts = np.unique(codes[~known], return_counts=True)
     missing = {f"#{code:06x}": int(count) for code, count in zip(there.tolist(), counts, strict=True)}
-    _note(path, missing, int(codes.size), legend.colours, strange)
+    zero = [int(key[1:], 16) for key, meaning in legend.colours.items() if meaning in (NONE, UNKNOWN)]
+    _note(path, missing, int(codes.size), int(np.isin(codes, zero).sum()), legend.colours, strange)
     return Segmentation(classes=legend.classes, probability_bytes=planes)
 
 
-def _note(path: Path, missing: Mapping[str, int], total: int, known: Mapping[str, Meaning], strange: Strange) -> None:
-    """Count pixels that the legend does not name; refuse a mask that is mostly of such."""
-    if sum(missing.values()) > _MOST_STRANGE * total:
+def _note(
+    path: Path, missing: Mapping[str, int], total: int, empty: int, known: Mapping[str, Meaning], strange: Strange
+) -> None:
+    """Count pixels that the legend does not name; refuse a mask of which most that is not background is such."""
+    if sum(missing.values()) > _MOST_STRANGE * (total - empty):
         raise ImageError(
-            f"{path.name} holds {named(list(missing), 'value', most=_SHOWN)} in most of its pixels, which the legend "
-            f"does not name ({', '.join(list(known)[:_SHOWN])}): is it the legend of these masks, and was the mask "
-            "stretched to grey levels?"
+            f"most of what {path.name} holds is not in the legend ({', '.join(list(missing)[:_SHOWN])}): was the mask "
+            f"stretched to grey levels, or is the legend ({', '.join(list(known)[:_SHOWN])}) of others?"
         )
     strange.counts.update(missing)
 
@@ -279,6 +297,13 @@ def _of_probabilities(path: Path, bands: NDArray[Any], names: Sequence[str], leg
 def _chances(path: Path, plane: NDArray[Any]) -> NDArray[np.uint8]:
     """Return probabilities as bytes: numbers of 0 to 1, or of 8 bits, of which 255 is 1."""
     if plane.dtype == np.uint8:
+        values = np.unique(plane)
+        if 0 < int(values[values < 255].max(initial=0)) < _FEW:
+            shown = ", ".join(map(str, values[:_SHOWN].tolist()))
+            raise ImageError(
+                f"{path.name} holds {shown}: these look like values of classes, which [values] reads; chances of 8 "
+                "bits go from 0 to 255"
+            )
         return np.floor(plane / 255 * CERTAIN + 0.5).astype(np.uint8)
     if plane.dtype.kind != "f":
         raise ImageError(f"{path.name} holds {plane.dtype} numbers: chances are floats of 0 to 1, or 8 bits")
@@ -310,7 +335,7 @@ def _of_array(path: Path, legend: Legend, strange: Strange) -> Segmentation:
             f"{path.name} is no array that can be read ({one_line(str(error))[:120]}): save it anew"
         ) from error
     named_planes = all(array.ndim == 2 for array in arrays.values()) and len({a.shape for a in arrays.values()}) == 1
-    if legend.bands and path.suffix.lower() == ".npz" and len(arrays) > 1 and named_planes:
+    if legend.bands and path.suffix.lower() == ".npz" and named_planes:
         return _of_probabilities(path, np.stack(list(arrays.values())), list(arrays), legend)
     if len(arrays) != 1:
         raise ImageError(

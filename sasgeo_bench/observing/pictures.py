@@ -3,6 +3,7 @@
 
 import datetime as dt
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from rasterio.vrt import WarpedVRT
 from sasgeo_bench.core.errors import CameraError, GridError, ImageError, SasgeoError
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.paths import read_bounded
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import Pose, bearing_deg, rotation
 from sasgeo_bench.geometry.projection import to_grid
@@ -37,8 +39,11 @@ LEAST_M: Final = 16.0  # of a smaller view nothing can be said
 FINEST_M: Final = 0.25  # pixels on the ground; finer ones are averaged
 STEEPEST_DEG: Final = 60.0  # of tilt: beyond it the ground of a view is far and coarse
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+_UNREAD: Final = frozenset(  # pictures and videos that drones and telephones write
+    {".dng", ".heic", ".heif", ".raw", ".arw", ".cr2", ".nef", ".bmp", ".gif", ".jxl", ".avif", ".mp4", ".mov", ".avi"}
+)
 MOST_BYTES: Final = 2**30  # of a georeferenced picture: windows of it are read
-_MOST_PHOTO_BYTES: Final = 64 * 2**20
+MOST_PHOTO_BYTES: Final = 64 * 2**20
 _FINE_M: Final = 128.0  # widest view in cells of `_CELLS_M[0]`, as in the suites
 _CELLS_M: Final = (0.5, 1.0)
 _MARGIN: Final = 1.25  # times the view's side is what is cut out of a picture
@@ -166,8 +171,13 @@ def list_pictures(path: Path) -> list[Path]:
     Raise `ImageError` if there is none, or it is an archive.
     """
     if path.is_dir():
-        found = sorted(one for one in path.rglob("*") if one.suffix.lower() in SUFFIXES and one.is_file())
-        found = [one for one in found if not any(part.startswith(".") for part in one.relative_to(path).parts)]
+        files = sorted(one for one in path.rglob("*") if one.is_file())
+        files = [one for one in files if not any(part.startswith(".") for part in one.relative_to(path).parts)]
+        found = [one for one in files if one.suffix.lower() in SUFFIXES]
+        other = Counter(one.suffix.lower() for one in files if one.suffix.lower() in _UNREAD)
+        if other:
+            kinds = ", ".join(f"{count} {suffix}" for suffix, count in other.most_common())
+            tell(f"passed over in {path}: {kinds}, which are not read: export them as JPEG, frames of a video too")
         if not found:
             raise ImageError(f"{path} holds no picture ({', '.join(SUFFIXES)}): name a folder that does")
         return found
@@ -200,7 +210,7 @@ def open_picture(path: Path, told: Told | None = None) -> OwnPicture:
         return found
     if path.suffix.lower() in (".png", ".webp"):  # without metadata of a drone that anybody writes
         return _plain(path, told)
-    return _of_photo(path, read_photo(path, most_bytes=_MOST_PHOTO_BYTES), told)
+    return _of_photo(path, read_photo(path, most_bytes=MOST_PHOTO_BYTES), told)
 
 
 def _plain(path: Path, told: Told) -> OwnPicture:
@@ -347,7 +357,7 @@ def see(picture: OwnPicture, told: Told | None = None) -> Sight:
     if picture.camera is None and picture.position_by == "georeference":
         return _seen_from_above(*_read_georeferenced(picture))
     name = picture.path.name
-    rgb = decode_image(read_bounded(picture.path, _MOST_PHOTO_BYTES), name=name)
+    rgb = decode_image(read_bounded(picture.path, MOST_PHOTO_BYTES), name=name)
     if picture.camera is None:
         assert told.ground_width_m is not None  # noqa: S101 - by `open_picture`
         gsd_m = told.ground_width_m / rgb.shape[1]

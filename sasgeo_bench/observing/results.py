@@ -24,6 +24,7 @@ from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.texts import csv_cell, plain
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.locate import COLUMNS, Fix, Located, Seen, Watch
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import paint_overview, pooled
@@ -31,11 +32,12 @@ from sasgeo_bench.regions.region_files import LAYERS, read_manifest
 from sasgeo_bench.sensing.birdseye import rectify
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.tasks.segmented import Segmented
-from sasgeo_bench.tasks.sheet import paint
+from sasgeo_bench.tasks.sheet import HIDDEN, paint
 
 TABLE: Final = "locate.csv"
 PAGE: Final = "index.html"
 STRIPS: Final = "pictures"
+PANELS: Final = ("picture", "what the segmenter saw", "evidence", "map there")
 MOST_SHOWN: Final = 300  # pictures on a page
 _PANEL_PX: Final = 240
 _MAP_PX: Final = 1000
@@ -49,23 +51,23 @@ class Strips(Watch):
     def __init__(self, folder: Path, region: Path) -> None:
         self._folder, self._map = folder / STRIPS, _Map(region)
 
-    def is_shown(self, number: int) -> bool:
+    def is_shown(self, number: int, fix: Fix) -> bool:
         """Return whether the strip of a picture is there, or none is wanted."""
-        return number >= MOST_SHOWN or strip_file(self._folder, number).is_file()
+        return number >= MOST_SHOWN or strip_file(self._folder, fix).is_file()
 
     def seen(self, number: int, seen: Seen) -> None:
         """Draw the strip of a picture."""
         if number >= MOST_SHOWN:
             return
         panels = strip(seen, self._map.at(seen))
-        path = strip_file(self._folder, number)
+        path = strip_file(self._folder, seen.fix)
         with fresh_file(path, mend=_MEND) as scratch:
             Image.fromarray(panels).save(scratch, format="WEBP", quality=80)
 
 
-def strip_file(folder: Path, number: int) -> Path:
-    """Return the file of a strip."""
-    return folder / f"{number:04d}.webp"
+def strip_file(folder: Path, fix: Fix) -> Path:
+    """Return the file of a strip: named by what the answer follows from, so that none shows another picture."""
+    return folder / f"{fix.key or 'none'}.webp"
 
 
 def strip(seen: Seen, there: Evidence | None) -> NDArray[np.uint8]:
@@ -253,8 +255,11 @@ body{font:15px/1.45 system-ui,sans-serif;margin:0 auto;max-width:1060px;padding:
 h1{font-size:1.45em;margin:.2em 0}p{margin:.4em 0}.facts{color:#555}.map{position:relative;max-width:100%;margin:12px 0}
 .map img{width:100%;display:block;border:1px solid #bbb}.map svg{position:absolute;inset:0;width:100%;height:100%}
 article{border-top:1px solid #ddd;padding:10px 0}h2{font-size:1.05em;margin:.2em 0;overflow-wrap:anywhere}
-.strip{max-width:100%;display:block;margin-top:6px}.heads{display:grid;grid-template-columns:repeat(4,1fr);max-width:978px;
-color:#555;font-size:.85em;margin-top:6px}b.state{color:#fff;border-radius:3px;padding:1px 7px;font-weight:600}
+.panels{display:flex;flex-wrap:wrap;gap:6px;margin-top:6px}figure{margin:0;flex:1 1 150px;max-width:240px}
+figure i{display:block;aspect-ratio:1;background-size:407.5% auto;background-repeat:no-repeat}
+figcaption{color:#555;font-size:.85em}.keys{color:#555;font-size:.85em;display:flex;flex-wrap:wrap;gap:2px 12px}
+.keys b{display:inline-block;width:.9em;height:.9em;margin-right:4px;border:1px solid #888;vertical-align:-.1em}
+b.state{color:#fff;border-radius:3px;padding:1px 7px;font-weight:600}
 .note{color:#8a4b00}footer{border-top:1px solid #ddd;margin-top:16px;color:#555;font-size:.85em}
 """
 
@@ -278,6 +283,7 @@ def page_text(located: Located) -> str:
         f"<p>{_text(summary)}. Accepted are fixes with P(false fix) of at most {request.most_false:g}.</p>",
         f'<p class="facts">Map of {located.manifest.extract.date}; {made}.</p>',
         _map_html(located),
+        _keys_html(located),
         more,
         *(_article(number, fix, request.into) for number, fix in enumerate(shown)),
         f"<footer>Map data {_text(located.manifest.attribution)}. {files}</footer></body></html>",
@@ -295,7 +301,7 @@ def _article(number: int, fix: Fix, folder: Path) -> str:
     if fix.p_false is not None:
         facts.append(f"P(false fix) {fix.p_false:.3f}")
     if fix.lon is not None and fix.lat is not None and fix.heading_deg is not None:
-        word = "at" if fix.is_accepted else "best guess"
+        word = "at" if fix.is_accepted else "best guess, not accepted:"
         facts.append(f"{word} {fix.lat:.6f}, {fix.lon:.6f} (latitude, longitude), heading {fix.heading_deg:.0f} deg")
     if fix.file_distance_m is not None:
         facts.append(f"{fix.file_distance_m:.0f} m from the position in the file")
@@ -304,12 +310,31 @@ def _article(number: int, fix: Fix, folder: Path) -> str:
         lines.append(f"<p>{_text(fix.reason)}.</p>")
     if fix.note:
         lines.append(f'<p class="note">{_text(fix.note)}.</p>')
-    if strip_file(folder / STRIPS, number).is_file():
-        heads = "".join(f"<span>{one}</span>" for one in ("picture", "what the segmenter saw", "evidence", "map there"))
-        lines.append(f'<div class="heads">{heads}</div>')
-        alt = f"{fix.file}: the picture, what the segmenter saw, the evidence, and the map at the fix"
-        lines.append(f'<img class="strip" src="{STRIPS}/{number:04d}.webp" alt="{_text(alt)}" loading="lazy">')
+    if strip_file(folder / STRIPS, fix).is_file():
+        url = f"{STRIPS}/{strip_file(Path(), fix)}"
+        shown = [
+            f'<figure><i role="img" aria-label="{one}" style="background-image:url({url});'
+            f'background-position:{100 * at / 3:.3f}% 0"></i><figcaption>{one}</figcaption></figure>'
+            for at, one in enumerate(PANELS)
+        ]
+        lines.append(f'<div class="panels">{"".join(shown)}</div>')
     return "\n".join([*lines, "</article>"])
+
+
+def _keys_html(located: Located) -> str:
+    """Return what the colours mean, and what the panels show."""
+    keys = [
+        f'<span><b style="background:{item.colour}"></b>{_text(item.title)}</span>'
+        for item in load_taxonomy().classes
+        if item.name in located.manifest.classes
+    ]
+    keys += [f'<span><b style="background:{HIDDEN}"></b>unknown</span>', "<span>hatched: not mapped</span>"]
+    return (
+        f'<div class="keys">{"".join(keys)}</div><p class="facts">Panels show the square of ground that was read, the '
+        "picture's up upwards; what a photo shows beside it is not used. Evidence is what the matcher gets of what the "
+        "segmenter saw: a colour where a class is likelier than not. A place can be right and yet be withheld, where "
+        "others fit nearly as well.</p>"
+    )
 
 
 def _map_html(located: Located) -> str:
@@ -346,15 +371,25 @@ def _map_html(located: Located) -> str:
             f'<a href="#p{number}"><g transform="translate({x:.1f} {y:.1f}) rotate({angle:.1f})"><title>'
             f"{number + 1}. {_text(fix.file)}: {_text(fix.status)}</title>"
             f'<path d="M0 {-arrow:.1f}L{0.62 * arrow:.1f} {0.8 * arrow:.1f}L0 {0.35 * arrow:.1f}L{-0.62 * arrow:.1f} '
-            f'{0.8 * arrow:.1f}Z" fill="{fill}" stroke="{colour}" stroke-width="2" vector-effect="non-scaling-stroke"/>'
-            "</g></a>"
+            f'{0.8 * arrow:.1f}Z" fill="{fill}" stroke="{colour}" stroke-width="2" '
+            'vector-effect="non-scaling-stroke"/></g>'
+            f'<text x="{x + arrow:.1f}" y="{y - 0.6 * arrow:.1f}" font-size="{1.3 * arrow:.1f}" fill="#111" '
+            f'stroke="#fff" stroke-width="{0.25 * arrow:.2f}" paint-order="stroke">{number + 1}</text></a>'
         )
+    bar_m = next(step for step in (5000, 2000, 1000, 500, 200, 100, 50) if step < 0.3 * (east - west) or step == 50)
+    at_y = north - south - size / 40
+    marks.append(
+        f'<path d="M{size / 40:.1f} {at_y:.1f}h{bar_m}" stroke="#111" stroke-width="3" '
+        'vector-effect="non-scaling-stroke"/>'
+        f'<text x="{size / 40:.1f}" y="{at_y - size / 120:.1f}" font-size="{size / 45:.1f}" stroke="#fff" '
+        f'stroke-width="{size / 250:.2f}" paint-order="stroke">{bar_m} m, north is up</text>'
+    )
     box = f"0 0 {east - west:.1f} {north - south:.1f}"
     return (
         f'<div class="map"><img alt="the map around the fixes" src="data:image/webp;base64,{data}">'
         f'<svg viewBox="{box}" preserveAspectRatio="none">{"".join(marks)}</svg></div>'
-        '<p class="facts">Arrows point where the picture\'s up points: filled ones are accepted. Broken line: the disc '
-        "that was searched for the first picture.</p>"
+        '<p class="facts">Arrows point where the picture\'s up points, the middle of each is the place of the camera; '
+        "filled ones are accepted. Broken line: the disc that was searched for the first picture.</p>"
     )
 
 

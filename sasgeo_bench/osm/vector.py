@@ -297,7 +297,7 @@ def _geo(path: Path) -> _Geo:
         stated = column.get("crs", f"EPSG:{WGS84}")
         crs = None if stated is None else pyproj.CRS.from_user_input(stated)
     except StoreError as error:
-        raise ExtractError(str(error)) from error
+        raise ExtractError(str(error).replace("cannot be read (", "cannot be read as GeoParquet (", 1)) from error
     except (ValueError, KeyError, TypeError, AttributeError, pyproj.exceptions.CRSError) as error:
         why = f"no {error} in it" if isinstance(error, KeyError) else one_line(str(error))[:200]
         raise ExtractError(f"{path} cannot be read as GeoParquet ({why}): write it with geopandas") from error

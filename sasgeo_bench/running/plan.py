@@ -264,7 +264,7 @@ def _check_seen(tasks: Sequence[Task], card: MatcherCard) -> None:
     if unseen is not None and "image" not in card.needs:
         raise StoreError(
             f"{unseen} holds pictures and no evidence, and {card.name!r} reads evidence: run sasgeo-bench segment "
-            f"--task {unseen} first"
+            f"--segmenter osm_unet --tasks {unseen} first"
         )
 
 

@@ -226,6 +226,49 @@ def test_pixels_that_are_not_square_ask_for_a_warp(own_out, values, legend, tmp_
         sgb.import_masks(folder, legend=legend, region=TOWN, out=own_out)
 
 
+def test_a_smaller_mask_of_a_georeferenced_picture_keeps_its_scale(own_out, region, pose, values, legend, tmp_path):
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    photos.mkdir()
+    masks.mkdir()
+    place = turned(pose.yaw_deg, PIXEL_M, east_m=pose.easting_m, north_m=pose.northing_m, size=(SIDE, SIDE))
+    rgb = np.full((3, SIDE, SIDE), 120, dtype=np.uint8)
+    shape = {"width": SIDE, "height": SIDE, "count": 3, "dtype": "uint8", "photometric": "RGB"}
+    with rasterio.open(
+        photos / "a.tif", "w", driver="GTiff", crs=f"EPSG:{region.grid.epsg}", transform=place, **shape
+    ) as target:
+        target.write(rgb)
+    Image.fromarray(values[::2, ::2], mode="L").save(masks / "a.png")
+    (task,) = sgb.import_masks(masks, photos=photos, legend=legend, region=TOWN, out=own_out)
+    (query,) = task.queries()
+    assert query.evidence.shape[0] * query.evidence.cell_size_m == pytest.approx(SIDE * PIXEL_M, abs=8)
+    assert (query.evidence.layer("water") == sgb.PRESENT).mean() == pytest.approx((values == 3).mean(), abs=0.02)
+
+
+def test_a_mask_that_is_stored_mirrored_is_refused(own_out, region, pose, values, legend, tmp_path):
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    place = turned(0.0, PIXEL_M, east_m=pose.easting_m, north_m=pose.northing_m, size=(SIDE, SIDE))
+    south_up = place @ Affine.translation(0, SIDE) @ Affine.scale(1, -1)
+    shape = {"width": SIDE, "height": SIDE, "count": 1, "dtype": "uint8"}
+    with rasterio.open(
+        folder / "a.tif", "w", driver="GTiff", crs=f"EPSG:{region.grid.epsg}", transform=south_up, **shape
+    ) as target:
+        target.write(values[::-1][None])
+    with pytest.raises(ConfigError, match="stored mirrored"):
+        sgb.import_masks(folder, legend=legend, region=TOWN, out=own_out)
+
+
+def test_two_photos_of_one_name_share_no_mask(own_out, region, pose, values, legend, tmp_path):
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    photos.mkdir()
+    masks.mkdir()
+    for name in ("a.jpg", "a.jpeg"):
+        photo_at(photos / name, region, pose)
+    Image.fromarray(values, mode="L").save(masks / "a.png")
+    with pytest.raises(ConfigError, match="share a mask"):
+        sgb.import_masks(masks, photos=photos, legend=legend, region=TOWN, out=own_out)
+
+
 def test_every_matcher_answers_masks(own_out, region, pose, values, legend, tmp_path):
     folder = tmp_path / "masks"
     folder.mkdir()

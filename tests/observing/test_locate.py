@@ -4,6 +4,8 @@
 import csv
 import json
 import math
+import os
+import shutil
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -25,6 +27,7 @@ from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.observing import locate as locating
 from sasgeo_bench.observing.chances import Chances, answers_for, shipped_answers
 from sasgeo_bench.observing.locate import COLUMNS, Fix, LocateRequest, locate
+from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import csv_text, geojson_text, gpx_text, kml_text, page_text, tum_text
 from sasgeo_bench.sensing.crops import drawn_crops
 
@@ -115,24 +118,55 @@ def test_the_page_shows_every_picture_and_what_the_chances_stand_on(located):
     assert page.count("<article") == 3
     assert "calibrated on" in page
     assert "OpenStreetMap contributors" in page
-    with Image.open(into / "pictures" / "0000.webp") as strip:
+    (first, _) = sorted((into / "pictures").iterdir(), key=lambda path: page.index(path.name))
+    assert page.count(first.name) == 4  # a panel each
+    with Image.open(first) as strip:
         assert strip.size == (4 * 240 + 3 * 6, 240)
         pixels = np.asarray(strip.convert("RGB"))
     assert pixels[:, :240].std() > 5  # the picture
     assert pixels[:, -240:].std() > 5  # the map
-    assert not (into / "pictures" / "0001.webp").exists()
 
 
 def test_a_second_call_asks_nothing_anew_and_tries_what_failed(located, towns, pictures, monkeypatch):
     into, found = located
     asked = []
     one = locating._Asker.ask
-    monkeypatch.setattr(locating._Asker, "ask", lambda self, path, name: (asked.append(name), one(self, path, name))[1])
+    monkeypatch.setattr(
+        locating._Asker, "ask", lambda self, path, name, key: (asked.append(name), one(self, path, name, key))[1]
+    )
     again = sgb.locate(
         pictures, out=towns, into=into, ground_width=SIDE_PX * PIXEL_M, region=TOWN, most_false=0.1, trusted=True
     )
     assert asked == ["b.jpg"]
     assert [replace(fix, seconds=0.0) for fix in again.fixes] == [replace(fix, seconds=0.0) for fix in found.fixes]
+
+
+def test_a_picture_that_is_added_or_changed_gets_an_answer_and_a_strip_of_its_own(towns, pictures, tmp_path):
+    folder = tmp_path / "own"
+    folder.mkdir()
+    shutil.copy(pictures / "a.tif", folder / "b.tif")
+
+    def call() -> dict[str, Fix]:
+        found = sgb.locate(folder, out=towns, into=tmp_path / "into", region=TOWN, trusted=True)
+        return {fix.file: fix for fix in found.fixes}
+
+    first = call()
+    with rasterio.open(folder / "b.tif") as source:
+        pixels, profile = source.read(), source.profile
+    with rasterio.open(folder / "a.tif", "w", **profile) as target:  # before it in the order of names
+        target.write(pixels[:, ::-1])
+    second = call()
+    assert second["b.tif"] == first["b.tif"]
+    strips = {name: (tmp_path / "into" / "pictures" / f"{fix.key}.webp").read_bytes() for name, fix in second.items()}
+    assert strips["a.tif"] != strips["b.tif"]
+    page = (tmp_path / "into" / "index.html").read_text()
+    assert page.index(second["a.tif"].key) < page.index(second["b.tif"].key)
+    # changed within a time stamp that is kept
+    times = (folder / "b.tif").stat()
+    with rasterio.open(folder / "b.tif", "r+") as target:
+        target.write(pixels[:, :, ::-1])
+    os.utime(folder / "b.tif", ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert call()["b.tif"].key != first["b.tif"].key
 
 
 def test_a_line_that_was_cut_off_is_asked_again(located, tmp_path):
@@ -150,8 +184,13 @@ def test_a_map_is_chosen_by_the_position(towns, pictures, tmp_path):
     assert locating._region_of(request, paths).name.partition("@")[0] == TOWN
     with pytest.raises(ConfigError, match=r"new-region NAME --center 100\.00000,10\.00000"):
         locating._region_of(replace(request, near=(100.0, 10.0)), paths)
+    swapped = [locating.read_manifest(towns / "regions" / TOWN).bounds_lonlat[at] for at in (1, 0)]
+    with pytest.raises(ConfigError, match="longitude comes first"):
+        locating._region_of(replace(request, near=(swapped[0] + 0.001, swapped[1] + 0.001)), paths)
+    with pytest.raises(ConfigError, match="no JPEG, TIFF or DNG"):  # the fault of the only picture
+        locating._region_of(request, paths[:1])
     with pytest.raises(ConfigError, match="no picture says where it was taken"):
-        locating._region_of(request, [pictures / "c.png"])
+        locating._region_of(replace(request, told=Told(ground_width_m=200.0)), [pictures / "c.png"])
 
 
 def test_a_picture_of_another_place_is_a_row(towns, pictures, tmp_path):
@@ -288,10 +327,11 @@ def test_names_of_files_are_text_on_the_page(located):
         (("--near", "9.5,147.1"), "--near is longitude,latitude"),
         (("--heading", "north"), "--heading is DEG"),
         (("--heading", "10+-0"), "--heading is DEG"),
+        (("--heading", "400"), "within -180 and 360"),
         (("--radius", "0"), "--radius lies within"),
         (("--height", "-5"), "height is above 0"),
         (("--most-false", "1"), "--most-false lies between"),
-        (("--region", "nowhere"), "nowhere"),
+        (("--region", "nowhere"), "built are"),
     ],
 )
 def test_words_that_make_no_sense_end_in_one_line(mistake, pictures, towns, words, hint):

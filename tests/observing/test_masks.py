@@ -82,6 +82,14 @@ def test_a_mask_that_was_stretched_to_grey_levels_is_refused(tmp_path):
         read_mask(tmp_path / "a.png", legend('[values]\n0 = "none"\n1 = "building"\n2 = "water"\n3 = "green"'))
 
 
+def test_background_does_not_hide_that_the_legend_is_of_other_masks(tmp_path):
+    cells = np.zeros((10, 10), dtype=np.uint8)
+    cells[:2, :5] = 126
+    np.save(tmp_path / "a.npy", cells)
+    with pytest.raises(ImageError, match="not in the legend"):
+        read_mask(tmp_path / "a.npy", legend('[values]\n0 = "none"\n1 = "building"'))
+
+
 def test_nodata_is_unknown(tmp_path):
     path = write_tiff(tmp_path / "a.tif", np.array([[[0, 1, 255, 255, 255]]], dtype=np.uint8), nodata=255)
     strange = Strange()
@@ -172,6 +180,10 @@ def test_a_coco_file_with_a_fault_is_refused_on_one_line(tmp_path, content, hint
         ('[colours]\n"red" = "water"', "#ff0000"),
         ('[bands]\n1 = "none"', "'none' is no class"),
         ('[values]\n1 = ["water", "none"]', "classes alone"),
+        ('[values]\n99999 = "water"', "0 to 65535"),
+        ('[values]\n01 = "water"\n1 = "building"', "twice"),
+        ('[bands]\n0 = "water"', "counted from 1"),
+        ('[bands]\n1 = "water"\n2 = "water"', "from two bands"),
     ],
 )
 def test_a_legend_that_means_nothing_is_refused(tmp_path, text, hint):
@@ -193,6 +205,7 @@ def test_a_legend_that_means_nothing_is_refused(tmp_path, text, hint):
         ("a.npy", lambda path: np.save(path, np.zeros((1, 2, 2))), '[bands]\n2 = "water"', "no band '2'"),
         ("a.npy", lambda path: np.save(path, np.zeros((2, 2))), '[bands]\n1 = "water"', "classes, rows, columns"),
         ("a.tif", lambda path: write_tiff(path, np.zeros((3, 2, 2), np.uint8), photometric="RGB"), VALUES, "3 bands"),
+        ("a.tif", lambda path: write_tiff(path, CELLS[None]), '[bands]\n1 = "water"', "look like values of classes"),
         ("a.tif", lambda path: write_tiff(path, CELLS[None]), '[colours]\n"#ff0000" = "water"', "8-bit red"),
         ("a.tif", lambda path: write_tiff(path, CELLS[None]), '[categories]\nroof = "building"', "no COCO file"),
     ],

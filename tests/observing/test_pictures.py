@@ -14,6 +14,7 @@ from PIL import Image
 from pyproj import Geod, Transformer
 
 from sasgeo_bench.core.errors import CameraError, ImageError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.pictures import (
@@ -195,11 +196,16 @@ def test_true_north_in_the_grid_is_that_of_the_ellipsoid():
         assert (bearing_deg - expected + 180) % 360 - 180 == pytest.approx(0.0, abs=0.01)
 
 
-def test_pictures_of_a_folder_are_listed_by_path(tmp_path):
-    for name in ("b.JPG", "a/c.png", ".hidden/d.jpg", "notes.txt"):
+def test_pictures_of_a_folder_are_listed_by_path_and_others_are_said(tmp_path):
+    lines = []
+    for name in ("b.JPG", "a/c.png", ".hidden/d.jpg", "notes.txt", "e.DNG", "f.mp4", "g.mp4"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
-    assert [path.relative_to(tmp_path).as_posix() for path in list_pictures(tmp_path)] == ["a/c.png", "b.JPG"]
+    with reporting(lines.append):
+        found = list_pictures(tmp_path)
+    assert [path.relative_to(tmp_path).as_posix() for path in found] == ["a/c.png", "b.JPG"]
+    assert len(lines) == 1
+    assert "2 .mp4, 1 .dng" in lines[0]
 
 
 @pytest.mark.parametrize(

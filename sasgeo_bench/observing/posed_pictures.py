@@ -3,6 +3,7 @@
 
 import datetime as dt
 import math
+import warnings
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -146,7 +147,7 @@ def pose_pictures(
                     continue
             row = None if table is None else table.find(name)
             if table is not None and row is None:
-                found.left_out["that the table does not name"].append(name)
+                found.left_out["that the table does not name, or in another folder"].append(name)
                 continue
             taken[row.name if row is not None else ""] += 1
             stand = _stand(path, name, row, epsg, sigma_m)
@@ -309,12 +310,13 @@ def _photo(path: Path) -> tuple[Photo, float | None]:
     if path.suffix.lower() in (".png", ".webp"):
         try:
             data = read_bounded(path, _MOST_BYTES)
-            with Image.open(BytesIO(data), formats=("PNG", "WEBP")) as image:
+            with warnings.catch_warnings(), Image.open(BytesIO(data), formats=("PNG", "WEBP")) as image:
+                warnings.simplefilter("ignore")  # of Pillow: odd metadata
                 # Pillow decodes a PNG to look for EXIF behind its pixels.
                 exif = image.getexif() if "exif" in image.info or b"exif" in data.lower() else {}
                 turned: Mapping[int, int] = {ExifTags.Base.Orientation: exif.get(ExifTags.Base.Orientation, 1)}
                 head = PhotoHead(size_px=image.size, exif=turned, inner={}, gps={}, xmp={})
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # SyntaxError: Pillow's
+        except Exception as error:  # Pillow fails at damaged files with errors of many kinds
             raise ImageError(f"{path.name} is no sound picture: copy it again") from error
         return photo_of(path.name, head), None
     head = read_head(path)

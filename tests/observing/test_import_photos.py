@@ -437,6 +437,15 @@ def test_a_png_or_webp_that_exif_turns_is_treated_as_a_jpeg(suffix, late, region
     assert any(f"(a.{suffix}) that EXIF turns" in line for line in lines)
 
 
+def test_a_png_with_damaged_exif_is_left_out(region, middle, laid):
+    request = laid([row(region, name, middle) for name in ("a.png", "b.png")])
+    path = request.pictures / "a.png"
+    Image.open(path).save(path, exif=b"garbage")
+    (task,), lines = quiet(request)
+    assert task.manifest.queries == 1
+    assert any("(a.png) that cannot be read (it is no sound picture" in line for line in lines)
+
+
 def test_two_pictures_of_one_name_do_not_share_a_row(region, middle, laid):
     request = laid([row(region, name, middle) for name in ("a.png", "b.png")])
     for folder in ("may", "june"):

@@ -229,7 +229,7 @@ def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
         position_by="EXIF" if lonlat else "",
         scale_sigma=0.03,
         taken_at=photo.taken_at,
-        note="" if photo.gimbal else _STRAIGHT,
+        note="; ".join(filter(None, ["" if photo.gimbal else _STRAIGHT, photo.place_fault])),
     )
     if told.ground_width_m is not None:
         if photo.gimbal is None:

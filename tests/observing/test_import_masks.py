@@ -269,6 +269,7 @@ def test_two_photos_of_one_name_share_no_mask(own_out, region, pose, values, leg
         sgb.import_masks(masks, photos=photos, legend=legend, region=TOWN, out=own_out)
 
 
+@pytest.mark.slow
 def test_every_matcher_answers_masks(own_out, region, pose, values, legend, tmp_path):
     folder = tmp_path / "masks"
     folder.mkdir()

@@ -141,6 +141,7 @@ def test_a_second_call_asks_nothing_anew_and_tries_what_failed(located, towns, p
     assert [replace(fix, seconds=0.0) for fix in again.fixes] == [replace(fix, seconds=0.0) for fix in found.fixes]
 
 
+@pytest.mark.slow
 def test_a_picture_that_is_added_or_changed_gets_an_answer_and_a_strip_of_its_own(towns, pictures, tmp_path):
     folder = tmp_path / "own"
     folder.mkdir()

@@ -223,13 +223,14 @@ def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
     if photo.gimbal_fault:
         raise CameraError(f"{path.name} has {photo.gimbal_fault}: use the drone's own file")
     lonlat = None if photo.lon_deg is None or photo.lat_deg is None else (photo.lon_deg, photo.lat_deg)
+    place_fault = f"position passed over: {photo.place_fault}" if photo.place_fault else ""
     known = OwnPicture(
         path=path,
         lonlat=lonlat,
         position_by="EXIF" if lonlat else "",
         scale_sigma=0.03,
         taken_at=photo.taken_at,
-        note="; ".join(filter(None, ["" if photo.gimbal else _STRAIGHT, photo.place_fault])),
+        note="; ".join(filter(None, ["" if photo.gimbal else _STRAIGHT, place_fault])),
     )
     if told.ground_width_m is not None:
         if photo.gimbal is None:
@@ -249,7 +250,7 @@ def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
         raise CameraError(f"{error}; or say --ground-width") from error
     gimbal = photo.gimbal or Attitude(pitch_deg=-90.0)
     # Anywhere on the central meridian of a zone, where north is that of the grid: headings stay against true north.
-    placed = replace(photo, lon_deg=_MERIDIAN_DEG, lat_deg=0.0, gimbal=gimbal)
+    placed = replace(photo, lon_deg=_MERIDIAN_DEG, lat_deg=0.0, place_fault="", gimbal=gimbal)
     sensor = placed.camera(height_m=height_m, intrinsics=lens)
     if sensor.tilt_deg > STEEPEST_DEG:
         raise CameraError(

@@ -10,7 +10,7 @@ import pytest
 import rasterio
 import shapely
 from affine import Affine
-from PIL import Image
+from PIL import ExifTags, Image
 from pyproj import Geod, Transformer
 
 from sasgeo_bench.core.errors import CameraError, ImageError
@@ -243,6 +243,14 @@ def test_a_photo_without_a_position_has_none(tmp_path):
     nowhere = {key: value for key, value in ZURICH.items() if isinstance(value, str)}
     found = open_picture(write_photo(tmp_path / "a.jpg", gps=nowhere))
     assert (found.lonlat, found.position_by) == (None, "")
+
+
+def test_a_position_of_another_datum_is_passed_over_and_said(tmp_path):
+    tokyo = ZURICH | {ExifTags.GPS.GPSMapDatum: "TOKYO"}
+    found = open_picture(write_photo(tmp_path / "a.jpg", gps=tokyo))
+    assert found.lonlat is None
+    assert found.heading_deg is not None
+    assert "TOKYO" in found.note
 
 
 def test_numbers_that_cannot_be_are_refused():

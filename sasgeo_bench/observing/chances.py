@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """P(false fix) of a user's pictures: fitted on answers to real pictures that taught the segmenter nothing."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -77,6 +78,12 @@ def shipped_answers() -> tuple[Answers, ...]:
     """Return the answers that ship, one for each matcher and segmenter."""
     data = resources.files("sasgeo_bench.observing").joinpath(FILE).read_bytes()
     return tuple(check_document(item, Answers, source=FILE) for item in parse_json(data))
+
+
+@cache
+def stored_sha256() -> str:
+    """Return the hash of the file of answers that ships."""
+    return hashlib.sha256(resources.files("sasgeo_bench.observing").joinpath(FILE).read_bytes()).hexdigest()
 
 
 def answers_for(matcher: str, version: str, segmenter: str) -> Answers | None:

@@ -23,7 +23,7 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.geometry.projection import to_grid, to_lonlat
 from sasgeo_bench.matching.matcher import MatcherCard, Prediction, lacks
 from sasgeo_bench.matching.segmenter import SegmenterCard
-from sasgeo_bench.observing.chances import Answers, Chances, answers_for
+from sasgeo_bench.observing.chances import Answers, Chances, answers_for, stored_sha256
 from sasgeo_bench.observing.pictures import (
     MOST_PHOTO_BYTES,
     OwnPicture,
@@ -400,7 +400,10 @@ class _Asker:
             _VERSION,
             name,
             _content(path),
+            request.matcher,  # several share a file, and so a hash of their code
+            request.segmenter,
             *codes,
+            stored_sha256(),
             {item: record.sha256 for item, record in self._manifest.files.items()},
             request.near,
             request.radius_m,

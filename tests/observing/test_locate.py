@@ -6,6 +6,7 @@ import json
 import math
 import os
 import shutil
+from concurrent.futures import Future
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -253,6 +254,34 @@ def test_stored_answers_order_right_before_false():
     assert without.p_false(answers.predictions()[0]) != chances.p_false(answers.predictions()[0])
     assert answers_for("sasgeo", "0", "osm_unet") is None
     assert answers_for("sasgeo", answers.version, "colour_thresholds") is None
+
+
+def test_an_answer_is_kept_for_its_own_words_alone(towns, pictures):
+    request = LocateRequest(pictures=pictures, out=towns, into=Path("b"))
+    manifest = locating.read_manifest(towns / "regions" / TOWN)
+    code = Future()
+    code.set_result(("same", "same"))
+
+    def key(**change):
+        asker = object.__new__(locating._Asker)
+        asker._request, asker._manifest, asker._codes = replace(request, **change), manifest, code
+        return asker.key(pictures / "a.tif", "a.tif")
+
+    changes = (
+        {},
+        {"matcher": "sasgeo_hard"},
+        {"segmenter": "osm_unet_held_out"},
+        {"radius_m": 250.0},
+        {"near": (9.0, 47.0)},
+        {"heading": (10.0, 5.0)},
+        {"is_turned": True},
+        {"told": Told(height_m=50.0)},
+        {"uses_position": False},
+        {"most_false": 0.1},
+    )
+    keys = [key(**change) for change in changes]
+    assert len(set(keys)) == len(changes)
+    assert key() == keys[0]
 
 
 def test_an_answer_says_why_it_is_withheld(towns):

@@ -156,6 +156,7 @@ def test_drawn_crops_get_the_poses_at_which_they_were_drawn(region, laid, tmp_pa
         assert (truth.detector, truth.is_present, truth.block[: len(TOWN)]) == ("real", True, TOWN)
 
 
+@pytest.mark.slow
 def test_the_truth_lies_anywhere_in_the_disc(region, middle, laid):
     rows = [row(region, f"{at}.png", offset(middle, at, -at)) for at in range(12)]
     (task,), _ = quiet(laid(rows))

@@ -128,6 +128,7 @@ def test_the_page_shows_every_picture_and_what_the_chances_stand_on(located):
     assert pixels[:, -240:].std() > 5  # the map
 
 
+@pytest.mark.slow
 def test_a_second_call_asks_nothing_anew_and_tries_what_failed(located, towns, pictures, monkeypatch):
     into, found = located
     asked = []
@@ -195,6 +196,7 @@ def test_a_map_is_chosen_by_the_position(towns, pictures, tmp_path):
         locating._region_of(replace(request, told=Told(ground_width_m=200.0)), [pictures / "c.png"])
 
 
+@pytest.mark.slow
 def test_a_picture_of_another_place_is_a_row(towns, pictures, tmp_path):
     found = locate(
         LocateRequest(
@@ -210,6 +212,7 @@ def test_a_picture_of_another_place_is_a_row(towns, pictures, tmp_path):
     assert "km beside the map" in found.fixes[0].reason
 
 
+@pytest.mark.slow
 def test_a_segmenter_that_must_learn_is_refused(towns, pictures, tmp_path):
     request = LocateRequest(
         pictures=pictures / "a.tif",
@@ -223,6 +226,7 @@ def test_a_segmenter_that_must_learn_is_refused(towns, pictures, tmp_path):
         locate(request)
 
 
+@pytest.mark.slow
 def test_a_matcher_without_stored_answers_accepts_nothing(towns, pictures, tmp_path):
     found = locate(
         LocateRequest(

@@ -142,6 +142,7 @@ def drawn(tmp_path_factory):
     return draw(""), draw(ANOTHER)
 
 
+@pytest.mark.slow
 def test_one_more_class_changes_no_query_in_which_it_is_not_drawn(drawn):
     (before, truths), (after, truths_after) = drawn
     assert set(before) == set(after) > {"clean"}

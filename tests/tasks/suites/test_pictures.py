@@ -97,6 +97,7 @@ def test_overlap_scale_and_tilt_are_asked_each_with_each_and_the_control_has_non
     assert {item.strength for item in flights if item.role == "stress"} == {1.0, 1.5, 2.0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.7, 0.4])
 @pytest.mark.parametrize("height_m", [40.0, 80.0])
 def test_beside_its_overlap_a_view_shows_nothing_that_the_map_has_there(place, share, height_m):

@@ -231,6 +231,7 @@ def test_sites_take_turns_in_the_kinds_of_ground_and_find_their_number_on_the_pi
         assert (kind == BUILT) == (houses.mean() >= 0.1) or abs(houses.mean() - 0.1) < 0.01
 
 
+@pytest.mark.slow
 def test_every_view_and_picture_of_every_site_is_shown(over):
     scene, sites = over
     suite = suite_on(scene)
@@ -262,6 +263,7 @@ def test_a_hole_that_hides_a_small_view_makes_no_site(village):
     assert suite.ground_at(scene_of(holed), pose) is None
 
 
+@pytest.mark.slow
 def test_places_of_sites_follow_no_lattice(village):
     scene = scene_of(village.pictured())
     sites = [site for root in range(4) for site in sites_of(scene, 8, root=root)]
@@ -338,6 +340,7 @@ class Dull(PicturedGround):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_dull_here", [False, True])
 def test_the_variance_of_the_laplacian_does_not_tell_a_view_of_another_town(is_dull_here, village):
     sharp = village.pictured()

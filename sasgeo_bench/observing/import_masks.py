@@ -17,7 +17,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.import_photos import ImportRequest, Perceived, table_of, view_cells, write_tasks
 from sasgeo_bench.observing.masks import MASKS, Legend, Strange, read_coco, read_mask
-from sasgeo_bench.observing.pictures import LEAST_M, WIDEST_M, OwnPicture, largest_square, open_picture
+from sasgeo_bench.observing.pictures import LEAST_M, WIDEST_M, OwnPicture, cell_of_view_m, largest_square, open_picture
 from sasgeo_bench.observing.posed_pictures import (
     GPS_SIGMA_M,
     PosedPicture,
@@ -32,12 +32,10 @@ from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import AerialImage
 from sasgeo_bench.sensing.photos import read_photo
 from sasgeo_bench.sensing.segmentation import Segmentation
-from sasgeo_bench.tasks.frame_evidence import for_classes
-from sasgeo_bench.tasks.suites.pictures import unseen
+from sasgeo_bench.tasks.frame_evidence import for_classes, unseen
 from sasgeo_bench.tasks.task_files import Task
 
 SUITE: Final = "masks"
-_FINE_M: Final = 128.0
 _SQUARE: Final = 0.01  # by which the sides of a pixel on the ground may differ
 
 
@@ -90,7 +88,7 @@ def import_masks(request: MaskRequest) -> tuple[Task, ...]:
         else:
             image_camera = scaled(one.picture.camera, rows, cols, plain(one.name))
         middle_m, side_m = largest_square(image_camera.footprint(Plane()))
-        cell_m = 1.0 if side_m > _FINE_M else 0.5
+        cell_m = cell_of_view_m(side_m)
         cells = view_cells(int(side_m / cell_m))
         pose = Pose(easting_m=middle_m[0], northing_m=middle_m[1], yaw_deg=0.0)
         evidence = to_evidence(seen, image_camera, Plane(), size_cells=cells, cell_size_m=cell_m, pose=pose)

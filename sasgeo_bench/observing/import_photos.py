@@ -36,6 +36,7 @@ from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.sensing.image import AerialImage
 from sasgeo_bench.tasks.build import put_task
+from sasgeo_bench.tasks.frame_evidence import unseen
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.query import (
@@ -52,7 +53,6 @@ from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, make_prior
 from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks.suites.base import Seeds
-from sasgeo_bench.tasks.suites.pictures import unseen
 from sasgeo_bench.tasks.task_files import Task, TaskOrigin, TruthManifest
 
 SUITE: Final = "photos"
@@ -281,6 +281,17 @@ def _follows(one: PosedPicture, last: PosedPicture) -> bool:
 Pairs = Iterator[tuple[Query, Truth]]
 
 
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """How one picture is asked: its id, what is known before, its seeds, and where it stands in a flight."""
+
+    query_id: str
+    prior: Prior
+    seeds: Seeds
+    step: Step | None = None
+    told: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+
+
 @dataclass(kw_only=True)
 class TaskWriter:
     """Writes tasks of pictures with poses; pictures that cannot be decoded are left out and counted.
@@ -350,7 +361,7 @@ class TaskWriter:
         for one in sorted(pictures, key=lambda one: seeds[one.name].digest("query")):
             own = seeds[one.name]
             prior = make_prior(one.pose, self.request.group, rng=own.rng("prior"))
-            pair = self._pair(one, suite, own.digest("query").hex()[:24], prior, own)
+            pair = self._pair(one, suite, _Asked(own.digest("query").hex()[:24], prior, own))
             if pair is not None:
                 count += 1
                 yield pair
@@ -375,76 +386,67 @@ class TaskWriter:
                     "is_seen": 1.0,
                 }
                 step = _step(flight, frame, steps)
-                pair = self._pair(one, suite, view_id(flight, frame), prior, seeds, step=step, told=told)
+                pair = self._pair(one, suite, _Asked(view_id(flight, frame), prior, seeds, step, told))
                 if pair is not None:
                     yield pair
 
-    def _pair(
-        self,
-        one: PosedPicture,
-        suite: str,
-        query_id: str,
-        prior: Prior,
-        seeds: Seeds,
-        *,
-        step: Step | None = None,
-        told: Mapping[str, float] = MappingProxyType({}),
-    ) -> tuple[Query, Truth] | None:
+    def _pair(self, one: PosedPicture, suite: str, asked: _Asked) -> tuple[Query, Truth] | None:
         """Return the query and truth of a picture; None, and the reason kept, if it cannot be decoded."""
         try:
             seen = self._pictured(one) if self.perceive is None else self.perceive(one)
         except SasgeoError as error:
-            self.failed_by.setdefault(f"that cannot be decoded ({reason_of(error, one.picture.path)})", []).append(
-                one.name
-            )
+            why = f"that cannot be decoded ({reason_of(error, one.picture.path)})"
+            self.failed_by.setdefault(why, []).append(one.name)
             return None
-        state, group, evidence = self.state, self.request.group, seen.evidence
-        height_m = 0.0 if one.picture.camera is None else one.position_m[2]
         taken = one.picture.taken_at
         query = Query(
-            query_id=query_id,
-            track="localization" if step is None else "sequence",
+            query_id=asked.query_id,
+            track="localization" if asked.step is None else "sequence",
             suite=suite,
             suite_version=_VERSION,
             part="test",
-            region=state.region,
-            prior_group=group.name,
-            evidence=evidence,
-            observed_on=state.date if taken is None else taken.date(),
+            region=self.state.region,
+            prior_group=self.request.group.name,
+            evidence=seen.evidence,
+            observed_on=self.state.date if taken is None else taken.date(),
             season="",
-            prior=prior,
+            prior=asked.prior,
             frames=seen.frames,
-            step=step,
+            step=asked.step,
         )
-        density = self._density(one, evidence)
+        return query, self._truth(one, asked, seen)
+
+    def _truth(self, one: PosedPicture, asked: _Asked, seen: Perceived) -> Truth:
+        """Return where a picture was taken, and how well that is known."""
+        height_m = 0.0 if one.picture.camera is None else one.position_m[2]
+        density = self._density(one, seen.evidence)
         block = "-".join(str(math.floor(value / _BLOCK_M)) for value in (one.pose.easting_m, one.pose.northing_m))
-        truth = Truth(
-            query_id=query_id,
+        return Truth(
+            query_id=asked.query_id,
             is_present=True,
             pose=one.pose,
             candidate=-1,
-            pair_id=seeds.digest("pair", one.name).hex()[:16],
+            pair_id=asked.seeds.digest("pair", one.name).hex()[:16],
             role="control",
             kind="own picture",
             strength=next((step for step in _STEPS_M if step >= one.sigma_m), one.sigma_m),
             strength_unit=TRUTH_SIGMA,
-            unknown_share=evidence.unknown_share,
+            unknown_share=seen.evidence.unknown_share,
             changed_share=0.0,
             feature_density=density,
             alias_index=None,
-            block=f"{state.region}-{block}",
+            block=f"{self.state.region}-{block}",
             scene=",".join(self.manifest.scenes),
             measured={
                 "truth_sigma_m": one.sigma_m,
                 "height_m": round(height_m, 1),
                 "tilt_deg": round(one.picture.tilt_deg, 1),
-                **told,
+                **asked.told,
                 **({UNANSWERABLE: 1.0} if density < LEAST_DRAWN else {}),
             },
             detector=REAL,
             labels=seen.labels,
         )
-        return query, truth
 
     def _pictured(self, one: PosedPicture) -> Perceived:
         """Return a picture of which nothing is seen yet."""

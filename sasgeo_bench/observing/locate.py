@@ -34,7 +34,7 @@ from sasgeo_bench.observing.pictures import (
     open_picture,
     see,
 )
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.plan import hidden_below, matcher_code, segmenter_code
@@ -43,7 +43,7 @@ from sasgeo_bench.running.worker import Limits, Reach, Worker, guarded
 from sasgeo_bench.sensing.birdseye import to_evidence
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.segmentation import Segmentation
-from sasgeo_bench.tasks.frame_evidence import for_classes
+from sasgeo_bench.tasks.frame_evidence import for_classes, unseen
 from sasgeo_bench.tasks.frames import Frame, encode_webp
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_files import query_bytes
@@ -433,7 +433,7 @@ class _Asker:
             return Fix(file=name, status="failed", reason=one_line(why), seconds=_since(begun))
         query = self._query(picture, sight, reply.found, prior, name)
         answer = self._answer(query)
-        fix = self._fix(picture, sight, query, answer, name, centre)
+        fix = self._fix(picture, sight, prior, answer, name, centre)
         return Seen(
             fix=replace(fix, key=key, seconds=_since(begun)),
             sight=sight,
@@ -483,20 +483,9 @@ class _Asker:
             east_m, north_m = sight.middle_m
             camera = sight.image.camera.moved(east_m=-east_m, north_m=-north_m)
             frames = (Frame(picture=encode_webp(sight.image.rgb), camera=camera),)
-        size, cell_m = sight.size_cells, sight.cell_size_m
+        empty = unseen(self._manifest.classes, sight.size_cells, sight.cell_size_m)
         evidence = _evidence_of(sight, seen)
-        empty = Evidence(
-            classes=self._manifest.classes,
-            cells=np.full((len(self._manifest.classes), size, size), UNKNOWN, dtype=np.uint8),
-            cell_size_m=cell_m,
-        )
         when = picture.taken_at.date() if picture.taken_at else self._manifest.extract.date
-        if prior.center_m is not None:
-            # The disc is of the camera, the view's middle lies beside it: as far as its heading tells, ahead.
-            yaw = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=prior.yaw_deg or 0.0)
-            shift = yaw.to_map(np.array([sight.middle_m]))[0] if prior.yaw_deg is not None else np.zeros(2)
-            middle_m = (float(prior.center_m[0] + shift[0]), float(prior.center_m[1] + shift[1]))
-            prior = replace(prior, center_m=middle_m)
         return Query(
             query_id=hashlib.sha256(name.encode()).hexdigest()[:24],
             track="localization",
@@ -508,7 +497,7 @@ class _Asker:
             evidence=for_classes(evidence, empty),
             observed_on=when,
             season="",
-            prior=prior,
+            prior=prior_of_view(prior, sight.middle_m),
             frames=frames,
         )
 
@@ -527,7 +516,7 @@ class _Asker:
         self,
         picture: OwnPicture,
         sight: Sight,
-        query: Query,
+        prior: Prior,
         answer: Prediction,
         name: str,
         centre: tuple[float, float] | None,
@@ -537,11 +526,11 @@ class _Asker:
             status="withheld",
             prior_lon=None if centre is None else round(centre[0], 7),
             prior_lat=None if centre is None else round(centre[1], 7),
-            prior_radius_m=query.prior.radius_m,
+            prior_radius_m=prior.radius_m,
             side_m=round(sight.side_m, 1),
             height_m=picture.height_m,
             taken_at=picture.taken_at.isoformat() if picture.taken_at else None,
-            note="; ".join(filter(None, [picture.note, self._unlike(picture, sight, query.prior)])),
+            note="; ".join(filter(None, [picture.note, self._unlike(picture, sight, prior)])),
         )
         if answer.status != "ok":
             why = one_line(f"{self._request.matcher}: {answer.status}: {answer.message}")
@@ -557,7 +546,7 @@ class _Asker:
             east_m, north_m, _ = to_grid(*picture.lonlat, self._manifest.epsg)
             away_m = round(math.hypot(stood.easting_m - east_m, stood.northing_m - north_m), 2)
         p_false = None if self.chances is None else round(self.chances.p_false(answer), 4)
-        status, reason = self._verdict(answer, p_false, query.prior)
+        status, reason = self._verdict(answer, p_false, prior)
         return replace(
             known,
             status=status,
@@ -606,6 +595,28 @@ class _Asker:
         ]
         found = [words for is_fault, words in faults if is_fault]
         return f"not calibrated on pictures like yours: {', '.join(found)}" if found else ""
+
+
+def prior_of_view(prior: Prior, middle_m: tuple[float, float]) -> Prior:
+    """Return the prior of a view whose middle lies beside its camera, (right, up), by that of the camera.
+
+    The disc moves as far as the heading tells, and grows by what the heading leaves open: it holds the middle of the
+    view wherever the camera stood in its own.
+
+    >>> camera = Prior(center_m=(0.0, 0.0), radius_m=500.0, yaw_deg=90.0, yaw_sigma_deg=10.0, scale_sigma=0.1)
+    >>> view = prior_of_view(camera, (0.0, 100.0))
+    >>> [round(value) for value in view.center_m], round(view.radius_m)
+    ([100, 0], 552)
+    """
+    beside_m = math.hypot(*middle_m)
+    if prior.center_m is None or prior.radius_m is None or not beside_m:
+        return prior
+    if prior.yaw_deg is None or prior.yaw_sigma_deg is None:
+        return replace(prior, radius_m=prior.radius_m + beside_m)
+    here = Pose(easting_m=prior.center_m[0], northing_m=prior.center_m[1], yaw_deg=prior.yaw_deg)
+    east_m, north_m = here.to_map(np.array([middle_m]))[0].tolist()
+    turned = min(2 * math.sin(math.radians(min(3 * prior.yaw_sigma_deg, 180.0)) / 2), 2.0)  # chord of three deviations
+    return replace(prior, center_m=(east_m, north_m), radius_m=prior.radius_m + turned * beside_m)
 
 
 def _evidence_of(sight: Sight, seen: Segmentation) -> Evidence:

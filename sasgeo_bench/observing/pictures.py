@@ -135,7 +135,7 @@ class Sight:
     @property
     def cell_size_m(self) -> float:
         """Return the side of a cell of the view, metres, as the suites have it."""
-        return _CELLS_M[self.side_m > _FINE_M]
+        return cell_of_view_m(self.side_m)
 
     @property
     def size_cells(self) -> int:
@@ -163,6 +163,11 @@ class Sight:
         """Return where the square lies if the camera stands at a pose of a map; the inverse of `camera_pose`."""
         east_m, north_m = camera.to_map(np.array([self.middle_m]))[0].tolist()
         return replace(camera, easting_m=east_m, northing_m=north_m)
+
+
+def cell_of_view_m(side_m: float) -> float:
+    """Return the side of a cell of a view, metres, as the suites have it: finer ones of small views."""
+    return _CELLS_M[side_m > _FINE_M]
 
 
 def list_pictures(path: Path) -> list[Path]:

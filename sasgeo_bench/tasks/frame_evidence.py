@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -74,6 +75,13 @@ def evidence_of(
     if len(views) > 1:
         together = accumulate(views, steps_between(poses), errors=_errors(frames), height_m=last.height_m)
     return together.to_evidence(reading)
+
+
+@lru_cache(maxsize=32)
+def unseen(classes: tuple[str, ...], size_cells: int, cell_size_m: float) -> Evidence:
+    """Return evidence that is all unknown, shared by all views: many are in memory at once."""
+    cells = np.full((len(classes), size_cells, size_cells), UNKNOWN, dtype=np.uint8)
+    return Evidence(classes=classes, cells=cells, cell_size_m=cell_size_m)
 
 
 def for_classes(found: Evidence | None, empty: Evidence) -> Evidence:

@@ -379,3 +379,19 @@ def test_a_line_of_a_fix_is_one_line():
 def test_no_picture_is_one_line(mistake, tmp_path):
     assert "there is no picture or folder" in mistake("locate", tmp_path / "none.jpg")
     assert "holds no picture" in mistake("locate", tmp_path)
+
+
+@pytest.mark.parametrize("yaw_deg", [None, 40.0])
+def test_the_disc_of_a_tilted_view_holds_its_middle_wherever_the_camera_stood(yaw_deg):
+    sigma_deg = None if yaw_deg is None else 10.0
+    prior = sgb.Prior(center_m=(5.0, 7.0), radius_m=100.0, yaw_deg=yaw_deg, yaw_sigma_deg=sigma_deg, scale_sigma=0.1)
+    view = locating.prior_of_view(prior, (3.0, 60.0))
+    rng = np.random.default_rng(2)
+    for _ in range(500):
+        turn, far_m = rng.uniform(0, 2 * np.pi), 100.0 * np.sqrt(rng.random())
+        heading = np.radians(rng.uniform(0, 360) if yaw_deg is None else yaw_deg + rng.uniform(-30, 30))
+        east_m = 5.0 + far_m * np.cos(turn) + 3.0 * np.cos(heading) + 60.0 * np.sin(heading)
+        north_m = 7.0 + far_m * np.sin(turn) - 3.0 * np.sin(heading) + 60.0 * np.cos(heading)
+        assert np.hypot(east_m - view.center_m[0], north_m - view.center_m[1]) <= view.radius_m + 1e-6
+    assert view.radius_m < 161.0
+    assert locating.prior_of_view(prior, (0.0, 0.0)) is prior

@@ -4,7 +4,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.sensing.accumulation import Errors, believed_steps, steps_between
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
 from sasgeo_bench.sensing.image import Picture
@@ -21,7 +20,7 @@ from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.sensing.rendering.scene import make_scene
 from sasgeo_bench.sensing.rendering.seasons import Season
 from sasgeo_bench.sensing.rendering.view import labels, render
-from sasgeo_bench.tasks.frame_evidence import poses_before
+from sasgeo_bench.tasks.frame_evidence import poses_before, unseen
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import PAINTED, PERCEIVED, Detector
 from sasgeo_bench.tasks.suites.base import MAIN_VIEW_CELLS, QueryDraft, Scene, Suite, SuiteCard, Variant, ViewRequest
@@ -169,13 +168,6 @@ def _overlapping(
     if shot.seeds.rng("overlap").random() < 0.5:  # the left side is lost instead
         is_own = is_own[::-1]
     return np.where(np.expand_dims(is_own, [at for at in range(seen.ndim) if at != axis]), seen, np.flip(seen, axis))
-
-
-@cache
-def unseen(classes: tuple[str, ...], size_cells: int, cell_size_m: float) -> Evidence:
-    """Return evidence that is all unknown, shared by all views: many are in memory at once."""
-    cells = np.full((len(classes), size_cells, size_cells), UNKNOWN, dtype=np.uint8)
-    return Evidence(classes=classes, cells=cells, cell_size_m=cell_size_m)
 
 
 _MOST_TILT_DEG: Final = 60.0  # of optical axes: the middle of a view must be seen

@@ -13,14 +13,14 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.sensing.accumulation import believed_steps, steps_between
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
 from sasgeo_bench.sensing.sharpness import no_sharper
-from sasgeo_bench.tasks.frame_evidence import poses_before
+from sasgeo_bench.tasks.frame_evidence import poses_before, unseen
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.pictured_ground import GROUNDS, Cut, PicturedGround
 from sasgeo_bench.tasks.query import REAL, Detector, PriorGroup, Role
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import QueryDraft, Scene, Site, Suite, SuiteCard, Variant, ViewRequest
 from sasgeo_bench.tasks.suites.flights import AGAIN, LONGEST_M, SEQUENCE, START, FlightSuite, Mission
-from sasgeo_bench.tasks.suites.pictures import AROUND, ODOMETRY, unseen
+from sasgeo_bench.tasks.suites.pictures import AROUND, ODOMETRY
 
 SIDES_M: Final = (384.0, 256.0, 192.0, 128.0, 96.0)
 MAIN_M: Final = 192.0  # of the view by which sites are chosen and kept apart

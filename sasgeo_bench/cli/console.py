@@ -6,7 +6,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -233,6 +233,16 @@ def shown_progress() -> Iterator[None]:
     with Bars() as bars, progress.reporting(tell, bars):
         _heard.counts = bars
         yield
+
+
+@contextmanager
+def said_after() -> Iterator[Callable[[object], None]]:
+    """Show progress, and print what is said meanwhile once its bars are gone: they redirect stdout to stderr."""
+    lines: list[object] = []
+    with shown_progress():
+        yield lines.append
+    for line in lines:
+        say(line)
 
 
 def print_table(table: Table) -> None:

@@ -8,8 +8,9 @@ from typing import Annotated, Final, Literal
 
 import typer
 
-from sasgeo_bench.cli.console import say, shown_progress
+from sasgeo_bench.cli.console import said_after
 from sasgeo_bench.cli.options import Options, Out, takes
+from sasgeo_bench.cli.targets import built_region
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.observing.import_masks import SUITE as MASKS
 from sasgeo_bench.observing.import_masks import MaskRequest
@@ -53,7 +54,7 @@ class PosedOptions(Options):
 class ImportPhotosOptions(PosedOptions):
     """Flags of import-photos."""
 
-    pictures: Annotated[Path, typer.Argument(help="folder of photos (JPEG, TIFF, DNG, PNG, WebP, GeoTIFF)")] = field(
+    pictures: Annotated[Path, typer.Argument(help="folder of photos (JPEG, TIFF, PNG, WebP, GeoTIFF)")] = field(
         kw_only=False
     )
     name: Annotated[str, typer.Option(help="suite of the task")] = SUITE
@@ -112,15 +113,15 @@ def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
 
 
 def _request(options: "ImportPhotosOptions | ImportMasksOptions", pictures: Path) -> ImportRequest:
-    folder = Path(options.region)
+    heights = Heights(height_m=options.height, dem=options.dem, takeoff_m=options.takeoff_height)
     return ImportRequest(
         pictures=pictures,
-        region=folder if (folder / "region.json").is_file() else options.out / "regions" / options.region,
+        region=built_region(options.region, options.out),
         out=options.out,
         name=options.name,
         poses=options.poses,
         facts=PoseFacts(epsg=options.epsg, origin=_origin(options.origin), pitch_zero=options.pitch_zero),
-        heights=Heights(height_m=options.height, dem=options.dem, takeoff_m=options.takeoff_height),
+        heights=heights,
         sigma_m=options.sigma,
         group=PriorGroup.parse(options.prior),
         seed=options.seed,
@@ -168,20 +169,14 @@ def import_masks(options: ImportMasksOptions) -> tuple[Task, ...]:
 
 def import_masks_command(options: ImportMasksOptions) -> None:
     """Make tasks of masks or probabilities that your own network made of pictures whose places are known."""
-    lines: list[object] = []  # printed once the progress bars are gone
-    with shown_progress():
-        import_masks(**vars(options) | {"say": lines.append})
-    for line in lines:
-        say(line)
+    with said_after() as say_later:
+        import_masks(**vars(options) | {"say": say_later})
 
 
 def import_photos_command(options: ImportPhotosOptions) -> None:
     """Make tasks of pictures of your own, whose places are known: single views, and flights."""
-    lines: list[object] = []  # printed once the progress bars are gone
-    with shown_progress():
-        import_photos(**vars(options) | {"say": lines.append})
-    for line in lines:
-        say(line)
+    with said_after() as say_later:
+        import_photos(**vars(options) | {"say": say_later})
 
 
 def _origin(text: str | None) -> tuple[float, float, float] | None:

@@ -11,9 +11,10 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, said_after, say
 from sasgeo_bench.cli.options import Options, Out, takes
-from sasgeo_bench.core.errors import ConfigError, counted, named
+from sasgeo_bench.cli.targets import built_region
+from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.observing.locate import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
@@ -91,7 +92,7 @@ def locate(options: LocateOptions) -> Located:
         pictures=options.pictures,
         out=options.out,
         into=into,
-        region=None if options.region is None else _region(options.region, options.out),
+        region=None if options.region is None else built_region(options.region, options.out),
         near=None if options.near is None else _lonlat(options.near),
         radius_m=options.radius,
         heading=heading,
@@ -143,11 +144,8 @@ def notes_of(fixes: Sequence[Fix]) -> list[str]:
 
 def locate_command(options: LocateOptions) -> None:
     """Find out where pictures of your own were taken, and how far to trust it: a line for each, tables and a page."""
-    lines: list[object] = []  # printed once the progress bars are gone
-    with shown_progress():
-        found = locate(**vars(options) | {"say": lines.append})
-    for line in lines:
-        say(line)
+    with said_after() as say_later:
+        found = locate(**vars(options) | {"say": say_later})
     counts = Counter(fix.status for fix in found.fixes)
     say(", ".join(f"{count} {status}" for status, count in counts.most_common()))
     say(found.request.into / PAGE)
@@ -162,16 +160,6 @@ def _name_of(pictures: Path) -> str:
     path = pictures.absolute()
     stem = re.sub(r"[^a-z0-9]+", "-", path.stem.lower()).strip("-")[:40] or "pictures"
     return f"{stem}-{hashlib.sha256(str(path).encode()).hexdigest()[:6]}"
-
-
-def _region(name: str, out: Path) -> Path:
-    """Return the folder of a built region; raise `ConfigError`, which lists those that are built, if there is none."""
-    for folder in (Path(name), out / "regions" / name):
-        if (folder / "region.json").is_file():
-            return folder
-    built = sorted(file.parent.name for file in (out / "regions").glob("*/region.json"))
-    there = f"built are {named(built, 'region', most=8)}" if built else "build one with build-region"
-    raise ConfigError(f"no region {name!r} is built in {out / 'regions'}: {there}")
 
 
 def _lonlat(text: str) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from sasgeo_bench.boards.profile_page import PAGE, check_profile, facts, write_profile
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, said_after, say, shown_progress
 from sasgeo_bench.cli.options import Dask, Options, Out, RegionFolders, takes
 from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.progress import tell
@@ -132,11 +132,8 @@ def run(options: RunOptions) -> RunReport:
 
 def run_command(options: RunOptions) -> None:
     """Ask a matcher every query of some tasks; goes on where an earlier run was cut off."""
-    lines: list[object] = []  # printed once the progress bars are gone: they redirect stdout to stderr
-    with shown_progress():
-        report = run(**vars(options) | {"say": lines.append})
-    for line in lines:
-        say(line)
+    with said_after() as say_later:
+        report = run(**vars(options) | {"say": say_later})
     if report.counts and not report.counts.keys() & SOUND:
         complain(f"no query was answered, so the command ends with status {CONTESTANT_FAILED}; the rows are kept")
         raise typer.Exit(CONTESTANT_FAILED)

@@ -35,6 +35,18 @@ def find_built(target: str, out: Path) -> Path | None:
     return next((folder for folder in (Path(target), out / "regions" / target) if (folder / MANIFEST).is_file()), None)
 
 
+def built_region(name: str, out: Path) -> Path:
+    """Return the folder of a built region, by its name or itself; a refusal suggests the nearest, or lists all."""
+    found = find_built(name, out)
+    if found is not None:
+        return found
+    built = sorted(path.parent.name for path in (out / "regions").glob(f"*/{MANIFEST}"))
+    near = difflib.get_close_matches(name, built, n=1)
+    there = f"; built are {named(built, 'region', most=MOST_NAMED)}" if built else ""
+    hint = f"did you mean {near[0]!r}?" if near else f"build-region it first{there}"
+    raise ConfigError(f"{out / 'regions'} holds no region {name!r}: {hint}")
+
+
 def is_split(target: str) -> bool:
     """Return True for the id of a shipped split, and for any .toml file."""
     return target.endswith(".toml") or target in list_split_files()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that show the weights of classes and places in the SASGeo scorer."""
 
-import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
@@ -12,11 +11,12 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out
+from sasgeo_bench.cli.targets import built_region
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.cards import WHERE, read_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.regions.region_files import MANIFEST, read_region
+from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.class_weights import (
     AGES_YEARS,
     check_age,
@@ -92,12 +92,7 @@ def read_model(path: Path | None) -> ScorerModel | None:
 
 def find_region(name: str, *, out: Path) -> Region:
     """Read a built region by its name or folder; a refusal suggests the nearest name."""
-    folder = Path(name) if (Path(name) / MANIFEST).is_file() else out / "regions" / name
-    if not (folder / MANIFEST).is_file():
-        built = sorted(path.parent.name for path in (out / "regions").glob(f"*/{MANIFEST}"))
-        near = difflib.get_close_matches(name, built, n=1)
-        hint = f", did you mean {near[0]!r}?" if near else ": build-region it first"
-        raise ConfigError(f"{out / 'regions'} holds no region {name!r}{hint}")
+    folder = built_region(name, out)
     region = read_region(folder)
     strange = [item for item in region.classes if item not in load_taxonomy().names]
     if strange:

@@ -77,7 +77,7 @@ class ImportRequest:
     Parameters
     ----------
     pictures : Path
-        Folder of photos (JPEG, TIFF, DNG), georeferenced pictures, or PNG and WebP with a table that tells their poses.
+        Folder of photos (JPEG, TIFF), georeferenced pictures, or PNG and WebP with a table that tells their poses.
     region : Path
         Folder of a built region.
     out : Path

@@ -9,19 +9,18 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, SasgeoError, named
+from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, named
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.observing.import_photos import ImportRequest, Perceived, table_of, view_cells, write_tasks
 from sasgeo_bench.observing.masks import MASKS, Legend, Strange, read_coco, read_mask
-from sasgeo_bench.observing.pictures import LEAST_M, WIDEST_M, OwnPicture, cell_of_view_m, largest_square, open_picture
+from sasgeo_bench.observing.pictures import OwnPicture, cell_of_view_m, largest_square, open_picture
 from sasgeo_bench.observing.posed_pictures import (
-    GPS_SIGMA_M,
     PosedPicture,
     PosedPictures,
+    from_above,
     is_georeferenced,
     pose_pictures,
 )
@@ -30,7 +29,6 @@ from sasgeo_bench.sensing.birdseye import to_evidence
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import AerialImage
-from sasgeo_bench.sensing.photos import read_photo
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.frame_evidence import for_classes, unseen
 from sasgeo_bench.tasks.task_files import Task
@@ -70,13 +68,16 @@ def import_masks(request: MaskRequest) -> tuple[Task, ...]:
             photos.pictures, table_of(photos), epsg=manifest.epsg, heights=photos.heights, sigma_m=photos.sigma_m
         )
     users = Counter(_key(one.name) for one in found.pictures)
-    for one in list(found.pictures):
-        why = "" if given.has(one.name) else f"without a mask of their name (there is {given.shown})"
-        why = why or ("that share a mask with another picture" if users[_key(one.name)] > 1 else "")
-        if why:
-            found.pictures.remove(one)
-            found.left_out[why].append(one.name)
-    _tell_turned(found)
+
+    def unmasked(one: PosedPicture) -> str:
+        if not given.has(one.name):
+            return f"without a mask of their name (there is {given.shown})"
+        return "that share a mask with another picture" if users[_key(one.name)] > 1 else ""
+
+    found.leave_out(unmasked)
+    turned = [one.name for one in found.pictures if one.is_turned]
+    if turned:
+        tell(f"{named(turned, 'photo')} turned by EXIF: masks are taken as upright, as such a photo is shown")
 
     def perceive(one: PosedPicture) -> Perceived:
         """Return the evidence of a mask under the camera of its picture, for the classes of the map."""
@@ -101,16 +102,6 @@ def import_masks(request: MaskRequest) -> tuple[Task, ...]:
     if strange.note():
         tell(strange.note())
     return made
-
-
-def _tell_turned(found: PosedPictures) -> None:
-    """Say of how many photos EXIF turns what is stored: their masks may be of either."""
-    turned = []
-    for one in found.pictures:
-        if one.picture.camera is not None and one.picture.path.suffix.lower() in (".jpg", ".jpeg"):
-            turned += [one.name] if read_photo(one.picture.path).orientation != 1 else []
-    if turned:
-        tell(f"{named(turned, 'photo')} turned by EXIF: masks are taken as upright, as such a photo is shown")
 
 
 def square_pixel_m(picture: OwnPicture, rows: int, cols: int) -> float:
@@ -232,19 +223,5 @@ def _georeferenced(path: Path, name: str, epsg: int, sigma_m: float | None) -> P
     assert picture.lonlat is not None  # noqa: S101 - by its georeference
     with open_geotiff(path) as source:
         rows, cols = source.shape
-    gsd_m = square_pixel_m(picture, rows, cols)
-    east_m, north_m, convergence_deg = to_grid(*picture.lonlat, epsg)
-    side_m = min(WIDEST_M, min(rows, cols) * gsd_m)
-    if side_m < LEAST_M:
-        raise CameraError(f"{path.name} shows a square of {side_m:.0f} m, a view has at least {LEAST_M:g} m")
-    return PosedPicture(
-        name=name,
-        picture=picture,
-        pose=Pose(
-            easting_m=east_m, northing_m=north_m, yaw_deg=((picture.heading_deg or 0.0) + convergence_deg) % 360.0
-        ),
-        sigma_m=GPS_SIGMA_M if sigma_m is None else sigma_m,
-        position_m=(east_m, north_m, 0.0),
-        side_m=side_m,
-        lens=f"georeferenced, pixels of {gsd_m:.2f} m",
-    )
+    square_pixel_m(picture, rows, cols)
+    return from_above(picture, name, epsg, sigma_m)

@@ -166,21 +166,25 @@ def write_tasks(
 ) -> tuple[Task, ...]:
     """Write the tasks of pictures with poses, as `import_photos` does; `perceive` as in `TaskWriter`."""
     state = State.read(request.region)
-    away: list[PosedPicture] = []
-    for one in list(found.pictures):
-        place_m = np.array([one.pose.easting_m, one.pose.northing_m])
-        if not state.is_mapped(place_m, one.side_m / math.sqrt(2)):  # in any heading
-            found.pictures.remove(one)
-            away.append(one)
-    off_m = [_off_m(one, manifest) for one in away]
-    far = [value for value in off_m if value > 0]
-    nearest = "" if not far else f"{min(far) / 1000:.1f} km" if min(far) >= 1000 else f"{min(far):.0f} m"
-    for one, value in zip(away, off_m, strict=True):
-        beside = f"that were taken {nearest} or more beside the map {state.region}"
-        found.left_out[beside if value > 0 else f"whose view is not wholly on the map {state.region}"].append(one.name)
+    off_m: dict[str, float] = {}  # of pictures that the map does not hold: how far beside it
+    for one in found.pictures:
+        if not state.is_mapped(np.array([one.pose.easting_m, one.pose.northing_m]), one.side_m / math.sqrt(2)):
+            off_m[one.name] = _off_m(one, manifest)  # for any heading
+    near_m = min((value for value in off_m.values() if value > 0), default=0.0)
+    nearest = f"{near_m / 1000:.1f} km" if near_m >= 1000 else f"{near_m:.0f} m"
+
+    def away(one: PosedPicture) -> str:
+        if one.name not in off_m:
+            return ""
+        if off_m[one.name] == 0:
+            return f"whose view is not wholly on the map {state.region}"
+        return f"that were taken {nearest} or more beside the map {state.region}"
+
+    swapped = any(one.name in off_m and _is_swapped(one, manifest) for one in found.pictures)
+    found.leave_out(away)
     _tell(found)
     if not found.pictures:
-        hint = "; longitude and latitude seem to be swapped" if any(_is_swapped(one, manifest) for one in away) else ""
+        hint = "; longitude and latitude seem to be swapped" if swapped else ""
         raise _nothing(request.pictures, found.left_out, hint)
     writer = TaskWriter(request=request, manifest=manifest, state=state, perceive=perceive)
     tasks = [writer.put(request.name, partial(writer.views, found.pictures), found.pictures)]

@@ -25,7 +25,6 @@ from sasgeo_bench.matching.matcher import MatcherCard, Prediction, lacks
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.observing.chances import Answers, Chances, answers_for, stored_sha256
 from sasgeo_bench.observing.pictures import (
-    MOST_PHOTO_BYTES,
     OwnPicture,
     Sight,
     Told,
@@ -42,6 +41,7 @@ from sasgeo_bench.running.segmenting import SegmenterProcess
 from sasgeo_bench.running.worker import Limits, Reach, Worker, guarded
 from sasgeo_bench.sensing.birdseye import to_evidence
 from sasgeo_bench.sensing.ground import Plane
+from sasgeo_bench.sensing.photos import MOST_BYTES
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.frame_evidence import for_classes, unseen
 from sasgeo_bench.tasks.frames import Frame, encode_webp
@@ -633,7 +633,7 @@ def _evidence_of(sight: Sight, seen: Segmentation) -> Evidence:
 def _content(path: Path) -> str:
     """Return what tells the content of a file: its hash, of a mosaic its size and when it last changed."""
     about = path.stat()
-    if about.st_size <= MOST_PHOTO_BYTES:
+    if about.st_size <= MOST_BYTES:
         return sha256_of(path)
     return f"{about.st_size} {about.st_mtime_ns} {about.st_ctime_ns}"
 

@@ -32,7 +32,7 @@ from sasgeo_bench.regions.layers import find_bands, selected
 from sasgeo_bench.sensing.camera import Attitude, Camera
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import AerialImage, decode_image
-from sasgeo_bench.sensing.photos import Photo, read_photo
+from sasgeo_bench.sensing.photos import MOST_BYTES, Photo, read_photo
 
 WIDEST_M: Final = 384.0  # side of a view: the largest that was measured
 LEAST_M: Final = 16.0  # of a smaller view nothing can be said
@@ -42,8 +42,6 @@ SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
 _UNREAD: Final = frozenset(  # pictures and videos that drones and telephones write
     {".dng", ".heic", ".heif", ".raw", ".arw", ".cr2", ".nef", ".bmp", ".gif", ".jxl", ".avif", ".mp4", ".mov", ".avi"}
 )
-MOST_BYTES: Final = 2**30  # of a georeferenced picture: windows of it are read
-MOST_PHOTO_BYTES: Final = 64 * 2**20
 _FINE_M: Final = 128.0  # widest view in cells of `_CELLS_M[0]`, as in the suites
 _CELLS_M: Final = (0.5, 1.0)
 _MARGIN: Final = 1.25  # times the view's side is what is cut out of a picture
@@ -215,7 +213,7 @@ def open_picture(path: Path, told: Told | None = None) -> OwnPicture:
         return found
     if path.suffix.lower() in (".png", ".webp"):  # without metadata of a drone that anybody writes
         return _plain(path, told)
-    return _of_photo(path, read_photo(path, most_bytes=MOST_PHOTO_BYTES), told)
+    return _of_photo(path, read_photo(path), told)
 
 
 def _plain(path: Path, told: Told) -> OwnPicture:
@@ -363,7 +361,7 @@ def see(picture: OwnPicture, told: Told | None = None) -> Sight:
     if picture.camera is None and picture.position_by == "georeference":
         return _seen_from_above(*_read_georeferenced(picture))
     name = picture.path.name
-    rgb = decode_image(read_bounded(picture.path, MOST_PHOTO_BYTES), name=name)
+    rgb = decode_image(read_bounded(picture.path, MOST_BYTES), name=name)
     if picture.camera is None:
         assert told.ground_width_m is not None  # noqa: S101 - by `open_picture`
         gsd_m = told.ground_width_m / rgb.shape[1]

@@ -5,7 +5,7 @@ import datetime as dt
 import math
 import warnings
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -26,21 +26,20 @@ from sasgeo_bench.observing.picture_poses import PicturePose, PoseTable, picture
 from sasgeo_bench.observing.pictures import (
     LEAST_M,
     STEEPEST_DEG,
+    WIDEST_M,
     OwnPicture,
     above_origin,
     largest_square,
     list_pictures,
     names_of,
     open_picture,
-    see,
 )
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
-from sasgeo_bench.sensing.photos import DJI, Photo, PhotoHead, number_of, photo_of, read_head, read_photo
+from sasgeo_bench.sensing.photos import DJI, MOST_BYTES, Photo, PhotoHead, number_of, photo_of, read_head
 
 GPS_SIGMA_M: Final = 3.3  # of one axis: 95 % within 8 m, as the GPS performance standard of 2020 states it
 _TILT_SIGMA: Final = 0.0175  # metres to a metre of height: a gimbal is right to a degree
-_MOST_BYTES: Final = 64 * 2**20
 _SAME_SHAPE: Final = 0.01  # by which the aspects of a picture and of a smaller copy differ, from rounding
 _CELL_M: Final = 10.0  # of the lattice of heights; GLO-30 and SRTM have 30 m
 _NADIR_DEG: Final = 5.0  # of tilt: a camera that leans less looks straight down, but for the wind
@@ -88,6 +87,8 @@ class PosedPicture:
         Seconds since 1970, by the camera's clock or the table's.
     lens : str
         What tells cameras apart: model and size.
+    is_turned : bool
+        Whether EXIF turns what the file stores.
     """
 
     name: str
@@ -98,6 +99,7 @@ class PosedPicture:
     side_m: float
     time_s: float | None = None
     lens: str = ""
+    is_turned: bool = False
 
 
 @dataclass(kw_only=True)
@@ -107,6 +109,14 @@ class PosedPictures:
     pictures: list[PosedPicture] = field(default_factory=list)
     left_out: "defaultdict[str, list[str]]" = field(default_factory=lambda: defaultdict(list))
     notes: list[str] = field(default_factory=list)
+
+    def leave_out(self, why: Callable[[PosedPicture], str]) -> None:
+        """Leave out each picture for the reason that is given of it, if one is."""
+        reasons = [why(one) for one in self.pictures]
+        for one, reason in zip(self.pictures, reasons, strict=True):
+            if reason:
+                self.left_out[reason].append(one.name)
+        self.pictures = [one for one, reason in zip(self.pictures, reasons, strict=True) if not reason]
 
 
 def pose_pictures(
@@ -143,7 +153,7 @@ def pose_pictures(
             if path.suffix.lower() in (".tif", ".tiff"):
                 picture = open_picture(path) if is_georeferenced(path) else None
                 if picture is not None and picture.position_by == "georeference":
-                    found.pictures.append(_from_above(picture, name, epsg, sigma_m))
+                    found.pictures.append(from_above(picture, name, epsg, sigma_m))
                     continue
             row = None if table is None else table.find(name)
             if table is not None and row is None:
@@ -193,9 +203,13 @@ def is_georeferenced(path: Path) -> bool:
         return False
 
 
-def _from_above(picture: OwnPicture, name: str, epsg: int, sigma_m: float | None) -> PosedPicture:
-    """Return a georeferenced picture, which is seen from straight above."""
+def from_above(picture: OwnPicture, name: str, epsg: int, sigma_m: float | None) -> PosedPicture:
+    """Return a georeferenced picture, which is seen from straight above; raise `CameraError` if it is too small."""
     assert picture.lonlat is not None  # noqa: S101 - by its georeference
+    assert picture.size_m is not None  # noqa: S101 - by its georeference
+    side_m = min(WIDEST_M, *picture.size_m)
+    if side_m < LEAST_M:
+        raise CameraError(f"{name} shows a square of {side_m:.0f} m, a view has at least {LEAST_M:g} m")
     east_m, north_m, convergence_deg = to_grid(*picture.lonlat, epsg)
     yaw_deg = ((picture.heading_deg or 0.0) + convergence_deg) % 360.0
     return PosedPicture(
@@ -204,7 +218,7 @@ def _from_above(picture: OwnPicture, name: str, epsg: int, sigma_m: float | None
         pose=Pose(easting_m=east_m, northing_m=north_m, yaw_deg=yaw_deg),
         sigma_m=GPS_SIGMA_M if sigma_m is None else sigma_m,
         position_m=(east_m, north_m, 0.0),
-        side_m=see(picture).side_m,
+        side_m=side_m,
         lens=f"georeferenced, pixels of {picture.gsd_m or 0.0:.2f} m",
     )
 
@@ -309,7 +323,7 @@ def _photo(path: Path) -> tuple[Photo, float | None]:
     """Return what a file says of its picture, and the standard deviation of its place if it states one."""
     if path.suffix.lower() in (".png", ".webp"):
         try:
-            data = read_bounded(path, _MOST_BYTES)
+            data = read_bounded(path, MOST_BYTES)
             with warnings.catch_warnings(), Image.open(BytesIO(data), formats=("PNG", "WEBP")) as image:
                 warnings.simplefilter("ignore")  # of Pillow: odd metadata
                 # Pillow decodes a PNG to look for EXIF behind its pixels.
@@ -323,7 +337,7 @@ def _photo(path: Path) -> tuple[Photo, float | None]:
     spreads = [number_of(head.xmp.get((DJI, f"RtkStd{axis}"))) for axis in ("Lon", "Lat")]
     known = [value for value in spreads if value is not None and value > 0]
     sigma_m = max(known) if len(known) == 2 else number_of(head.gps.get(ExifTags.GPS.GPSHPositioningError))
-    return read_photo(path, most_bytes=_MOST_BYTES), sigma_m if sigma_m is not None and sigma_m > 0 else None
+    return photo_of(path.name, head), sigma_m if sigma_m is not None and sigma_m > 0 else None
 
 
 def _clocks(seen: Sequence[_Stand]) -> list[str]:
@@ -400,6 +414,7 @@ def _posed(stand: _Stand, heights: Heights, dem: Dem | None) -> PosedPicture | s
         side_m=side_m,
         time_s=row.time_s if row is not None and row.time_s is not None else stand.exif_s,
         lens=f"{photo.model or 'camera'} {photo.width_px} x {photo.height_px}",
+        is_turned=photo.orientation != 1,
     )
 
 

@@ -23,6 +23,7 @@ from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
 
+MOST_BYTES: Final = 64 * 2**20  # of a photo
 _TIFF_MARKS: Final = (b"II*\0", b"MM\0*")
 _WIDTH, _HEIGHT, _KIND, _PARTS, _XMP, _CROP = 256, 257, 254, 330, 700, 50720
 _FRAME: Final = ("adobe:ns:meta", "http://www.w3.org/1999/02/22-rdf-syntax-ns#")  # namespaces that hold no property
@@ -45,8 +46,11 @@ class PhotoHead:
     xmp: Xmp
 
 
-def read_head(path: Path) -> PhotoHead:
-    """Read the head of a photo; raise `ImageError` if it is no sound JPEG, TIFF or DNG."""
+def read_head(path: Path, *, most_bytes: int = MOST_BYTES) -> PhotoHead:
+    """Read the head of a photo; raise `ImageError` if it is no sound JPEG, TIFF or DNG of so many bytes at most."""
+    size = path.stat().st_size if path.is_file() else 0  # what is no file is refused when it is opened
+    if size > most_bytes:
+        raise ImageError(f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first")
     try:
         with warnings.catch_warnings(), plain_file(path).open("rb") as file:
             warnings.simplefilter("ignore")  # of Pillow: odd metadata; what is needed and odd is refused later
@@ -409,8 +413,6 @@ def _lens_text(size_px: Size) -> str:
     return f"{size_px[0]:.0f} x {size_px[1]:.0f}"
 
 
-MOST_BYTES: Final = 64 * 2**20  # of a photo
-
 _STRAIGHT_DOWN_DEG: Final = -90.0
 _HORIZON_DEG: Final = 90.0 - 1e-6  # of tilt; the optical axis of a camera that leans more meets no level ground
 _UNITS_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's units of FocalPlaneXResolution
@@ -544,10 +546,7 @@ def read_photo(path: str | Path, *, most_bytes: int = MOST_BYTES, most_pixels: i
     say is None, so that a photo without pose is refused only where its pose is asked for (`Photo.camera`).
     """
     path = Path(path)
-    size = path.stat().st_size if path.is_file() else 0  # what is no file is refused when it is opened
-    if size > most_bytes:
-        raise ImageError(f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first")
-    return photo_of(path.name, read_head(path), most_pixels=most_pixels)
+    return photo_of(path.name, read_head(path, most_bytes=most_bytes), most_pixels=most_pixels)
 
 
 def photo_of(name: str, head: PhotoHead, *, most_pixels: int = 200_000_000) -> Photo:

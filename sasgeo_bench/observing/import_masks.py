@@ -16,7 +16,7 @@ from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.observing.import_photos import ImportRequest, Perceived, table_of, view_cells, write_tasks
 from sasgeo_bench.observing.masks import MASKS, Legend, Strange, read_coco, read_mask
-from sasgeo_bench.observing.pictures import OwnPicture, cell_of_view_m, largest_square, open_picture
+from sasgeo_bench.observing.pictures import OwnPicture, cell_of_view_m, largest_square, open_picture, resized
 from sasgeo_bench.observing.posed_pictures import (
     PosedPicture,
     PosedPictures,
@@ -137,15 +137,7 @@ def scaled(camera: Camera, rows: int, cols: int, name: str) -> Camera:
             f"the mask of {name} has {cols} x {rows} pixels, its picture {lens.width_px} x {lens.height_px}: it was "
             "cut or turned"
         )
-    (focal_x, focal_y), (centre_x, centre_y) = lens.focal_px, lens.centre_px
-    small = replace(
-        lens,
-        width_px=cols,
-        height_px=rows,
-        focal_px=(focal_x * across, focal_y * down),
-        centre_px=(centre_x * across, centre_y * down),
-    )
-    return replace(camera, intrinsics=small)
+    return replace(camera, intrinsics=resized(lens, (cols, rows), (across, down)))
 
 
 @dataclass(frozen=True, kw_only=True)

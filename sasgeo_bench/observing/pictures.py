@@ -29,7 +29,7 @@ from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import Pose, bearing_deg, rotation
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.regions.layers import find_bands, selected
-from sasgeo_bench.sensing.camera import Attitude, Camera
+from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import AerialImage, decode_image
 from sasgeo_bench.sensing.photos import MOST_BYTES, Photo, read_photo
@@ -444,16 +444,25 @@ def averaged(image: AerialImage, factor: int) -> AerialImage:
     """Return a picture with pixels so many times as wide; rows and columns that fill no whole pixel are left out."""
     rows, cols = (side // factor for side in image.shape)
     rgb = cv2.resize(image.rgb[: rows * factor, : cols * factor], (cols, rows), interpolation=cv2.INTER_AREA)
-    lens = image.camera.intrinsics
-    (focal_x, focal_y), (centre_x, centre_y) = lens.focal_px, lens.centre_px
-    small = replace(
-        lens,
-        width_px=cols,
-        height_px=rows,
-        focal_px=(focal_x / factor, focal_y / factor),
-        centre_px=(centre_x / factor, centre_y / factor),
-    )
+    small = resized(image.camera.intrinsics, (cols, rows), (1 / factor, 1 / factor))
     return replace(image, rgb=np.ascontiguousarray(rgb), camera=replace(image.camera, intrinsics=small))
+
+
+def resized(lens: Intrinsics, size_px: tuple[int, int], times: tuple[float, float]) -> Intrinsics:
+    """Return the lens of a picture of another size, width and height, that shows the same so many times as large.
+
+    >>> lens = Intrinsics.from_field_of_view(horizontal_deg=90.0, width_px=400, height_px=300)
+    >>> resized(lens, (200, 150), (0.5, 0.5)).focal_px
+    (100.0, 100.0)
+    """
+    (focal_x, focal_y), (centre_x, centre_y) = lens.focal_px, lens.centre_px
+    return replace(
+        lens,
+        width_px=size_px[0],
+        height_px=size_px[1],
+        focal_px=(focal_x * times[0], focal_y * times[1]),
+        centre_px=(centre_x * times[0], centre_y * times[1]),
+    )
 
 
 def _read_georeferenced(picture: OwnPicture) -> tuple[NDArray[np.uint8], float, str]:

@@ -33,6 +33,7 @@ from sasgeo_bench.observing.pictures import (
     list_pictures,
     names_of,
     open_picture,
+    resized,
 )
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
@@ -266,13 +267,7 @@ def _fitted(lens: Intrinsics, photo: Photo) -> Intrinsics | None:
     across, down = photo.width_px / lens.width_px, photo.height_px / lens.height_px
     if abs(across / down - 1) > _SAME_SHAPE:
         return None
-    return replace(
-        lens,
-        width_px=photo.width_px,
-        height_px=photo.height_px,
-        focal_px=(lens.focal_px[0] * across, lens.focal_px[1] * down),
-        centre_px=(lens.centre_px[0] * across, lens.centre_px[1] * down),
-    )
+    return resized(lens, (photo.width_px, photo.height_px), (across, down))
 
 
 def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: float | None) -> _Stand | str:

@@ -225,7 +225,9 @@ def table_of(request: ImportRequest) -> PoseTable | None:
     if request.poses is not None:
         facts = request.facts
         if not facts.names and not facts.times_s:  # a TUM file's pictures: those of the folder, in their order
-            facts = replace(facts, names=tuple(names_of(list_pictures(request.pictures), request.pictures)))
+            facts = replace(
+                facts, names=tuple(names_of(list_pictures(request.pictures, is_told=False), request.pictures))
+            )
         table = read_pose_table(request.poses, facts)
         given = facts.names
         if table.kind == "TUM" and not request.facts.names and list(given) != sorted(given, key=_by_number):

@@ -168,17 +168,18 @@ def cell_of_view_m(side_m: float) -> float:
     return _CELLS_M[side_m > _FINE_M]
 
 
-def list_pictures(path: Path) -> list[Path]:
+def list_pictures(path: Path, *, is_told: bool = True) -> list[Path]:
     """Return the pictures of a folder and of those below it, sorted by path, or the one file that is named.
 
-    Raise `ImageError` if there is none, or it is an archive.
+    Pictures of formats that are not read are told, unless they were before. Raise `ImageError` if there is no picture,
+    or it is an archive.
     """
     if path.is_dir():
         files = sorted(one for one in path.rglob("*") if one.is_file())
         files = [one for one in files if not any(part.startswith(".") for part in one.relative_to(path).parts)]
         found = [one for one in files if one.suffix.lower() in SUFFIXES]
         other = Counter(one.suffix.lower() for one in files if one.suffix.lower() in _UNREAD)
-        if other:
+        if other and is_told:
             kinds = ", ".join(f"{count} {suffix}" for suffix, count in other.most_common())
             tell(f"passed over in {path}: {kinds}, which are not read: export them as JPEG, frames of a video too")
         if not found:
@@ -210,7 +211,7 @@ def open_picture(path: Path, told: Told | None = None) -> OwnPicture:
     """
     told = told or Told()
     if path.suffix.lower() in (".tif", ".tiff") and (found := _georeferenced(path)) is not None:
-        return found
+        return found if told == Told() else replace(found, note="height and width passed over: its georeference tells")
     if path.suffix.lower() in (".png", ".webp"):  # without metadata of a drone that anybody writes
         return _plain(path, told)
     return _of_photo(path, read_photo(path), told)

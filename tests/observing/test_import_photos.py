@@ -504,7 +504,9 @@ def test_a_tum_file_names_the_pictures_of_its_folder_by_their_order(region, midd
     for name in ("a", "b", "c"):
         (request.pictures / f"{name}.png").unlink()
         write_photo(request.pictures / f"{name}.jpg", focal=24)
-    tasks, _ = quiet(replace(request, poses=tum, facts=PoseFacts(origin=(lon, lat, 0.0))))
+    (request.pictures / "film.mp4").write_bytes(b"")
+    tasks, lines = quiet(replace(request, poses=tum, facts=PoseFacts(origin=(lon, lat, 0.0))))
+    assert sum("1 .mp4" in line for line in lines) == 1
     east = sorted(round(truth.pose.easting_m - middle[0], 1) for truth in tasks[0].truths)
     assert east == pytest.approx([50.0, 60.0, 70.0], abs=3.0)  # its east is the true one
     steps = [query.step.frame for query in tasks[1].queries()]

@@ -64,7 +64,9 @@ def test_a_georeferenced_picture_says_its_middle_its_pixels_and_where_up_is(tmp_
     )
     azimuth_deg = GEOD.inv(lon, lat, *up)[0] % 360
     assert (found.heading_deg - azimuth_deg + 180) % 360 - 180 == pytest.approx(0, abs=0.02)
-    assert (found.position_by, found.heading_by) == ("georeference", "georeference")
+    assert (found.position_by, found.heading_by, found.note) == ("georeference", "georeference", "")
+    told = open_picture(path, Told(height_m=80.0))
+    assert (told.gsd_m, told.note) == (found.gsd_m, "height and width passed over: its georeference tells")
 
 
 def test_a_picture_in_degrees_gets_square_pixels(tmp_path):

@@ -308,3 +308,15 @@ def named(monkeypatch):
         return "module_of_mine:ONE"
 
     return put
+
+
+@pytest.fixture
+def lay(tmp_path):
+    """Write a file, given as text or bytes; its name says nothing."""
+
+    def write(content, name="poses.txt"):
+        path = tmp_path / name
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    return write

@@ -17,18 +17,6 @@ POSE = "0 0 80 0 0 0 1"
 TEXT = f"# time x y z qx qy qz qw\n\n0.0 {POSE}\n0.5\t5 0 80 0 0 0 1\n  # a note\n1e0 10 0 80 0 0 0 1\r\n"
 
 
-@pytest.fixture
-def lay(tmp_path):
-    """Write a file, given as text or bytes."""
-
-    def write(content, name="run.txt"):
-        path = tmp_path / name
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-        return path
-
-    return write
-
-
 @pytest.mark.parametrize("content", [TEXT, gzip.compress(TEXT.encode(), mtime=0)])
 @pytest.mark.parametrize("name", ["run.txt", "run.gz"])
 def test_comments_blank_lines_and_any_white_space_are_read_packed_or_not_whatever_the_name(lay, content, name) -> None:

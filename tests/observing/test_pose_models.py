@@ -19,18 +19,6 @@ LOCAL = PoseFacts(origin=ORIGIN)
 TURN = cameras.camera(37.0, -63.0, 11.0)
 
 
-@pytest.fixture
-def lay(tmp_path):
-    """Write a file, given as text or bytes."""
-
-    def write(content, name="images.txt"):
-        path = tmp_path / name
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-        return path
-
-    return write
-
-
 def matrix_of(pose):
     """Rows: right, down, ahead of a pose's camera, north, east, down turned to east, north, up."""
     forward, right, down = pose.attitude.matrix.T

@@ -20,18 +20,6 @@ from tests import pose_files as cameras
 from tests.pose_files import ANGLES, NAMES, ORIGIN, SHIFTS, UTM, local, matrices, places, utm
 
 
-@pytest.fixture
-def lay(tmp_path):
-    """Write a file, given as text or bytes; its name says nothing."""
-
-    def write(content, name="poses.dat"):
-        path = tmp_path / name
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
-        return path
-
-    return write
-
-
 def gimbal_table():
     header = ("file_name", "lon_deg", "lat_deg", "altitude", "gimbal_yaw", "gimbal_pitch", "gimbal_roll")
     return cameras.rows(header, np.column_stack([places(), ANGLES]))

@@ -29,7 +29,8 @@ from PIL import Image
 import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.geometry.projection import to_grid, to_lonlat
-from sasgeo_bench.observing.locate import Fix, LocateRequest, locate
+from sasgeo_bench.observing.fixes import Fix, LocateRequest
+from sasgeo_bench.observing.locate import locate
 from sasgeo_bench.scoring.intervals import wilson_share
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane

@@ -17,7 +17,7 @@ from sasgeo_bench.cli.targets import built_region
 from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
-from sasgeo_bench.observing.locate import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
+from sasgeo_bench.observing.fixes import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results

@@ -13,8 +13,9 @@ from pydantic import Field
 
 from sasgeo_bench.core.config import JsonDocument, check_document
 from sasgeo_bench.core.json import parse_json
-from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import Prediction, Rejector
+from sasgeo_bench.observing.pictures import OwnPicture, Sight
 
 FILE: Final = "chances.json"
 _AWAY_M: Final = 1000.0  # where the rival of a stored answer stands: outside any tolerance
@@ -71,6 +72,23 @@ class Answers(JsonDocument):
             f"calibrated on {len(self.rows)} answers of {self.matcher} to real pictures of {places}, places from which "
             f"{self.asked} had not learned"
         )
+
+    def unlike(self, picture: OwnPicture, sight: Sight, prior: Prior) -> str:
+        """Return in what a picture differs from those that P(false fix) was calibrated on; empty where in nothing."""
+        least_m, most_m = self.sides_m
+        gsd_m = sight.side_m / min(sight.image.shape) if sight.image.shape else 0.0
+        faults = [
+            (not least_m <= sight.side_m <= most_m, f"a view of {sight.side_m:.0f} m, not {least_m:g} to {most_m:g}"),
+            (gsd_m > 1.2 * self.most_gsd_m, f"pixels of {gsd_m:.1f} m, more than {self.most_gsd_m:.1f}"),
+            (prior.radius_m is None, "a whole map searched"),
+            ((prior.radius_m or 0) > self.most_radius_m, f"a disc of more than {self.most_radius_m:g} m"),
+            (prior.yaw_deg is None, "an unknown heading"),
+            ((prior.yaw_sigma_deg or 0) > self.most_yaw_sigma_deg, "a vague heading"),
+            (prior.scale_sigma > self.most_scale_sigma, f"a size known to {100 * prior.scale_sigma:.0f} % only"),
+            (picture.tilt_deg > 10, f"a camera tilted by {picture.tilt_deg:.0f} degrees"),
+        ]
+        found = [words for is_fault, words in faults if is_fault]
+        return f"not calibrated on pictures like yours: {', '.join(found)}" if found else ""
 
 
 @cache

@@ -7,14 +7,14 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Final, Literal, Self
+from typing import Final, Self
 
 import numpy as np
 
 from sasgeo_bench.core import progress
-from sasgeo_bench.core.errors import ConfigError, MatchError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.errors import ConfigError, MatchError, SasgeoError, StoreError
 from sasgeo_bench.core.folders import locked, sha256_of
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import tell
@@ -24,10 +24,10 @@ from sasgeo_bench.geometry.projection import to_grid, to_lonlat
 from sasgeo_bench.matching.matcher import MatcherCard, Prediction, lacks
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.observing.chances import Answers, Chances, answers_for, stored_sha256
+from sasgeo_bench.observing.fixes import SEGMENTER, Fix, Located, LocateRequest, Seen, Watch, verdict
 from sasgeo_bench.observing.pictures import (
     OwnPicture,
     Sight,
-    Told,
     list_pictures,
     names_of,
     open_picture,
@@ -38,7 +38,7 @@ from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.plan import hidden_below, matcher_code, segmenter_code
 from sasgeo_bench.running.segmenting import SegmenterProcess
-from sasgeo_bench.running.worker import Limits, Reach, Worker, guarded
+from sasgeo_bench.running.worker import Reach, Worker, guarded
 from sasgeo_bench.sensing.birdseye import to_evidence
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.photos import MOST_BYTES
@@ -48,153 +48,10 @@ from sasgeo_bench.tasks.frames import Frame, encode_webp
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_files import query_bytes
 
-Found = Literal["found", "withheld", "not on this map", "failed"]
-MATCHER: Final = "sasgeo"
-SEGMENTER: Final = "osm_unet"
-RADIUS_M: Final = 500.0
-NOWHERE: Final = 0.9  # from this P(false fix) on, no place of the map explains a picture
-MOST_FALSE: Final = 0.05
 ANSWERS: Final = "answers.jsonl"
 _GIMBAL_SIGMA_DEG: Final = 10.0  # of a drone's compass
 _TOP_K: Final = 25
 _VERSION: Final = 1  # raised when the same question gets another answer by this file
-
-
-@dataclass(frozen=True, kw_only=True)
-class LocateRequest:
-    """Pictures to locate, and what is known of them.
-
-    Parameters
-    ----------
-    pictures : Path
-        A file, or a folder of them.
-    out : Path
-        Root of what is built; regions lie in `out/regions`.
-    into : Path
-        Folder of the results.
-    region : Path, optional
-        Folder of the map; by default the newest built one that holds the first position.
-    near : tuple of float, optional
-        Longitude and latitude of the middle of the search, in place of positions in the files.
-    radius_m : float
-        Of the disc that is searched.
-    heading : tuple of float, optional
-        Of the pictures' up, degrees clockwise from true north, and its standard deviation.
-    is_turned : bool
-        Whether any heading is possible, whatever the files say.
-    told : Told
-        Height or width of the ground.
-    matcher, segmenter : str
-        Names, or module:Class.
-    uses_position : bool
-        Whether positions in the files may be used; without, and without `near`, the whole map is searched.
-    most_false : float
-        P(false fix) up to which a fix is accepted.
-    """
-
-    pictures: Path
-    out: Path
-    into: Path
-    region: Path | None = None
-    near: tuple[float, float] | None = None
-    radius_m: float = RADIUS_M
-    heading: tuple[float, float] | None = None
-    is_turned: bool = False
-    told: Told = field(default_factory=Told)
-    matcher: str = MATCHER
-    segmenter: str = SEGMENTER
-    uses_position: bool = True
-    most_false: float = MOST_FALSE
-    limits: Limits = field(default_factory=Limits)
-    is_sandboxed: bool = True
-
-    def __post_init__(self) -> None:
-        if not 10.0 <= self.radius_m <= 100_000.0:
-            raise ConfigError(f"--radius lies within 10 and 100000 m, got {self.radius_m!r}")
-        if self.heading is not None and not -180 <= self.heading[0] <= 360:
-            raise ConfigError(f"--heading lies within -180 and 360 degrees, got {self.heading[0]:g}")
-        if not 0 < self.most_false < 1:
-            raise ConfigError(f"--most-false lies between 0 and 1, got {self.most_false!r}")
-        if self.near is not None and not (abs(self.near[0]) <= 180 and abs(self.near[1]) <= 84):  # UTM ends there
-            raise ConfigError(f"--near is longitude,latitude, degrees, got {self.near[0]:g},{self.near[1]:g}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fix:
-    """Where one picture was taken, as far as that can be said; the columns of `locate.csv`, and what a page shows.
-
-    `lon`, `lat` and `x_m`, `y_m` (in the map's CRS) are the best place for the camera; `heading_deg` counts from true
-    north. They are there unless nothing was found at all, also where the fix is not accepted. `prior_*` is the disc
-    that was searched. `file_distance_m` is how far the best place is from the position that the file carries.
-    """
-
-    file: str
-    status: Found
-    lon: float | None = None
-    lat: float | None = None
-    x_m: float | None = None
-    y_m: float | None = None
-    heading_deg: float | None = None
-    p_false: float | None = None
-    is_accepted: bool = False
-    reason: str = ""
-    prior_lon: float | None = None
-    prior_lat: float | None = None
-    prior_radius_m: float | None = None
-    file_distance_m: float | None = None
-    seconds: float = 0.0
-    # What is not in the table:
-    side_m: float | None = None
-    height_m: float | None = None
-    taken_at: str | None = None
-    note: str = ""
-    view: tuple[float, float, float, float] | None = None  # easting, northing, yaw and scale of the view's middle
-    key: str = ""  # of all that the answer follows from
-
-    @property
-    def view_pose(self) -> Pose | None:
-        """Return the pose of the middle of what was seen, on the map's grid."""
-        if self.view is None:
-            return None
-        return Pose(easting_m=self.view[0], northing_m=self.view[1], yaw_deg=self.view[2], scale=self.view[3])
-
-
-COLUMNS: Final = (
-    *("file", "status", "lon", "lat", "x_m", "y_m", "heading_deg", "p_false", "is_accepted", "reason"),
-    *("prior_lon", "prior_lat", "prior_radius_m", "file_distance_m", "seconds"),
-)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Seen:
-    """What a page shows of one picture beside its fix."""
-
-    fix: Fix
-    sight: Sight
-    segmentation: Segmentation
-    evidence: Evidence
-
-
-@dataclass(frozen=True, kw_only=True)
-class Located:
-    """All fixes of a request, in the order of the pictures; the map they are on, and how far P(false fix) holds."""
-
-    request: LocateRequest
-    region: Path
-    manifest: Manifest
-    fixes: tuple[Fix, ...]
-    calibration: str
-
-
-class Watch:
-    """Gets each picture when it is done; what it does not want costs nothing."""
-
-    def seen(self, number: int, seen: Seen) -> None:
-        """Take a picture with its evidence."""
-
-    def is_shown(self, number: int, fix: Fix) -> bool:  # noqa: ARG002
-        """Return whether a picture was taken by an earlier call already."""
-        return True
 
 
 def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = None) -> Located:
@@ -216,7 +73,7 @@ def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = No
     """
     paths = list_pictures(request.pictures)
     names = names_of(paths, request.pictures)
-    region = request.region or _region_of(request, paths)
+    region = request.region or map_of(request, paths)
     manifest = read_manifest(region)
     watch = None if watching is None else watching(region)
     request.into.mkdir(parents=True, exist_ok=True)
@@ -264,7 +121,7 @@ def _kept(path: Path) -> dict[str, Fix]:
     return found
 
 
-def _region_of(request: LocateRequest, paths: Sequence[Path]) -> Path:
+def map_of(request: LocateRequest, paths: Sequence[Path]) -> Path:
     """Return the newest built region that holds the place of the search, and say which."""
     place, of = _place_of(request, paths)
     found, is_swapped = [], False
@@ -394,26 +251,7 @@ class _Asker:
 
     def key(self, path: Path, name: str) -> str:
         """Return the hash of all that an answer follows from."""
-        request = self._request
-        codes = self._codes.result()
-        asked = [
-            _VERSION,
-            name,
-            _content(path),
-            request.matcher,  # several share a file, and so a hash of their code
-            request.segmenter,
-            *codes,
-            stored_sha256(),
-            {item: record.sha256 for item, record in self._manifest.files.items()},
-            request.near,
-            request.radius_m,
-            request.heading,
-            request.is_turned,
-            asdict(request.told),
-            request.uses_position,
-            request.most_false,
-        ]
-        return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:32]
+        return answer_key(self._request, self._manifest, self._codes.result(), path, name)
 
     def ask(self, path: Path, name: str, key: str) -> Seen | Fix:
         """Locate one picture; a fault of the picture is a row."""
@@ -521,6 +359,7 @@ class _Asker:
         name: str,
         centre: tuple[float, float] | None,
     ) -> Fix:
+        unlike = "" if self.chances is None else self.chances.answers.unlike(picture, sight, prior)
         known = Fix(
             file=name,
             status="withheld",
@@ -530,7 +369,7 @@ class _Asker:
             side_m=round(sight.side_m, 1),
             height_m=picture.height_m,
             taken_at=picture.taken_at.isoformat() if picture.taken_at else None,
-            note="; ".join(filter(None, [picture.note, self._unlike(picture, sight, prior)])),
+            note="; ".join(filter(None, [picture.note, unlike])),
         )
         if answer.status != "ok":
             why = one_line(f"{self._request.matcher}: {answer.status}: {answer.message}")
@@ -546,7 +385,7 @@ class _Asker:
             east_m, north_m, _ = to_grid(*picture.lonlat, self._manifest.epsg)
             away_m = round(math.hypot(stood.easting_m - east_m, stood.northing_m - north_m), 2)
         p_false = None if self.chances is None else round(self.chances.p_false(answer), 4)
-        status, reason = self._verdict(answer, p_false, prior)
+        status, reason = verdict(answer, p_false, prior, self._request.most_false)
         return replace(
             known,
             status=status,
@@ -562,39 +401,27 @@ class _Asker:
             view=(round(view.easting_m, 3), round(view.northing_m, 3), round(view.yaw_deg, 3), round(view.scale, 5)),
         )
 
-    def _verdict(self, answer: Prediction, p_false: float | None, prior: Prior) -> tuple[Found, str]:
-        if p_false is None:
-            return "withheld", "P(false fix) is not calibrated for this matcher and segmenter"
-        if p_false <= self._request.most_false:
-            return "found", ""
-        where = "on the map" if prior.radius_m is None else f"within {prior.radius_m:g} m"
-        if p_false >= NOWHERE:
-            return "not on this map", f"no place {where} explains what is seen"
-        rivals = round(answer.diagnostics.get("modes_above", 1.0)) - 1
-        alike = f"{counted(rivals, 'other place')} {where} {'looks' if rivals == 1 else 'look'} alike"
-        weak = f"P(false fix) is above {self._request.most_false:g}"
-        return "withheld", alike if rivals > 0 else weak
 
-    def _unlike(self, picture: OwnPicture, sight: Sight, prior: Prior) -> str:
-        """Return in what a picture differs from those that P(false fix) was calibrated on; empty where in nothing."""
-        chances = self.chances
-        if chances is None:
-            return ""
-        known = chances.answers
-        least_m, most_m = known.sides_m
-        gsd_m = sight.side_m / min(sight.image.shape) if sight.image.shape else 0.0
-        faults = [
-            (not least_m <= sight.side_m <= most_m, f"a view of {sight.side_m:.0f} m, not {least_m:g} to {most_m:g}"),
-            (gsd_m > 1.2 * known.most_gsd_m, f"pixels of {gsd_m:.1f} m, more than {known.most_gsd_m:.1f}"),
-            (prior.radius_m is None, "a whole map searched"),
-            ((prior.radius_m or 0) > known.most_radius_m, f"a disc of more than {known.most_radius_m:g} m"),
-            (prior.yaw_deg is None, "an unknown heading"),
-            ((prior.yaw_sigma_deg or 0) > known.most_yaw_sigma_deg, "a vague heading"),
-            (prior.scale_sigma > known.most_scale_sigma, f"a size known to {100 * prior.scale_sigma:.0f} % only"),
-            (picture.tilt_deg > 10, f"a camera tilted by {picture.tilt_deg:.0f} degrees"),
-        ]
-        found = [words for is_fault, words in faults if is_fault]
-        return f"not calibrated on pictures like yours: {', '.join(found)}" if found else ""
+def answer_key(request: LocateRequest, manifest: Manifest, codes: tuple[str, str], path: Path, name: str) -> str:
+    """Return the hash of all that an answer follows from; `codes` are hashes of the matcher's and segmenter's code."""
+    asked = [
+        _VERSION,
+        name,
+        _content(path),
+        request.matcher,  # several share a file, and so a hash of their code
+        request.segmenter,
+        *codes,
+        stored_sha256(),
+        {item: record.sha256 for item, record in manifest.files.items()},
+        request.near,
+        request.radius_m,
+        request.heading,
+        request.is_turned,
+        asdict(request.told),
+        request.uses_position,
+        request.most_false,
+    ]
+    return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def prior_of_view(prior: Prior, middle_m: tuple[float, float]) -> Prior:

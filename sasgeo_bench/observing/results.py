@@ -23,7 +23,7 @@ from sasgeo_bench.core.errors import counted
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.texts import csv_cell, plain
 from sasgeo_bench.geometry.projection import to_grid
-from sasgeo_bench.observing.locate import COLUMNS, Fix, Located, Seen, Watch
+from sasgeo_bench.observing.fixes import COLUMNS, Fix, Located, Seen, Watch
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.layers import read_layers, read_overview

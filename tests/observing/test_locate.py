@@ -6,7 +6,6 @@ import json
 import math
 import os
 import shutil
-from concurrent.futures import Future
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -27,7 +26,8 @@ from sasgeo_bench.geometry.projection import to_lonlat
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.observing import locate as locating
 from sasgeo_bench.observing.chances import Chances, answers_for, shipped_answers
-from sasgeo_bench.observing.locate import COLUMNS, Fix, LocateRequest, locate
+from sasgeo_bench.observing.fixes import COLUMNS, Fix, LocateRequest, verdict
+from sasgeo_bench.observing.locate import answer_key, locate, map_of
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import csv_text, geojson_text, gpx_text, kml_text, page_text, tum_text
 from sasgeo_bench.sensing.crops import drawn_crops
@@ -184,16 +184,16 @@ def test_a_line_that_was_cut_off_is_asked_again(located, tmp_path):
 def test_a_map_is_chosen_by_the_position(towns, pictures, tmp_path):
     request = LocateRequest(pictures=pictures, out=towns, into=tmp_path)
     paths = [pictures / "b.jpg", pictures / "a.tif"]
-    assert locating._region_of(request, paths).name.partition("@")[0] == TOWN
+    assert map_of(request, paths).name.partition("@")[0] == TOWN
     with pytest.raises(ConfigError, match=r"new-region NAME --center 100\.00000,10\.00000"):
-        locating._region_of(replace(request, near=(100.0, 10.0)), paths)
+        map_of(replace(request, near=(100.0, 10.0)), paths)
     swapped = [locating.read_manifest(towns / "regions" / TOWN).bounds_lonlat[at] for at in (1, 0)]
     with pytest.raises(ConfigError, match="longitude comes first"):
-        locating._region_of(replace(request, near=(swapped[0] + 0.001, swapped[1] + 0.001)), paths)
+        map_of(replace(request, near=(swapped[0] + 0.001, swapped[1] + 0.001)), paths)
     with pytest.raises(ConfigError, match="no JPEG, TIFF or DNG"):  # the fault of the only picture
-        locating._region_of(request, paths[:1])
+        map_of(request, paths[:1])
     with pytest.raises(ConfigError, match="no picture says where it was taken"):
-        locating._region_of(replace(request, told=Told(ground_width_m=200.0)), [pictures / "c.png"])
+        map_of(replace(request, told=Told(ground_width_m=200.0)), [pictures / "c.png"])
 
 
 @pytest.mark.slow
@@ -263,13 +263,9 @@ def test_stored_answers_order_right_before_false():
 def test_an_answer_is_kept_for_its_own_words_alone(towns, pictures):
     request = LocateRequest(pictures=pictures, out=towns, into=Path("b"))
     manifest = locating.read_manifest(towns / "regions" / TOWN)
-    code = Future()
-    code.set_result(("same", "same"))
 
     def key(**change):
-        asker = object.__new__(locating._Asker)
-        asker._request, asker._manifest, asker._codes = replace(request, **change), manifest, code
-        return asker.key(pictures / "a.tif", "a.tif")
+        return answer_key(replace(request, **change), manifest, ("same", "same"), pictures / "a.tif", "a.tif")
 
     changes = (
         {},
@@ -288,16 +284,13 @@ def test_an_answer_is_kept_for_its_own_words_alone(towns, pictures):
     assert key() == keys[0]
 
 
-def test_an_answer_says_why_it_is_withheld(towns):
-    request = LocateRequest(pictures=Path("a"), out=towns, into=Path("b"))
-    asker = object.__new__(locating._Asker)
-    asker._request = request
+def test_an_answer_says_why_it_is_withheld():
     prior = sgb.Prior(center_m=(0.0, 0.0), radius_m=500.0, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
     answer = Prediction(query_id="q", diagnostics={"modes_above": 3.0})
-    assert asker._verdict(answer, 0.05, prior) == ("found", "")
-    assert asker._verdict(answer, 0.3, prior) == ("withheld", "2 other places within 500 m look alike")
-    assert asker._verdict(answer, 0.9, prior)[0] == "not on this map"
-    assert asker._verdict(answer, None, prior)[0] == "withheld"
+    assert verdict(answer, 0.05, prior, 0.05) == ("found", "")
+    assert verdict(answer, 0.3, prior, 0.05) == ("withheld", "2 other places within 500 m look alike")
+    assert verdict(answer, 0.9, prior, 0.05)[0] == "not on this map"
+    assert verdict(answer, None, prior, 0.05)[0] == "withheld"
 
 
 FIXES = (

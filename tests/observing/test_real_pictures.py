@@ -10,7 +10,8 @@ import pytest
 import sasgeo_bench as sgb
 from benchmarks.own_photos import is_right, take
 from sasgeo_bench.core.errors import SasgeoError
-from sasgeo_bench.observing.locate import LocateRequest, locate
+from sasgeo_bench.observing.fixes import LocateRequest
+from sasgeo_bench.observing.locate import locate
 from sasgeo_bench.observing.pictures import list_pictures, open_picture, see
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file

@@ -63,6 +63,14 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
     return replace(log, height_m=np.full(len(log), height_m), notes=notes)
 
 
+def read_places(path: Path) -> Floats:
+    """Return longitude and latitude of the points of a log, shape (N, 2); what else it holds needs no unit."""
+    is_table = path.suffix.lower() in (".csv", ".pos")
+    facts = LogFacts(time_unit="none", height_unit="none", angle_unit="none") if is_table else None
+    log = read_log(path, facts)
+    return np.column_stack([log.lon_deg, log.lat_deg])
+
+
 def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     suffix = path.suffix.lower()
     is_table = suffix in (".csv", ".pos")

@@ -4,6 +4,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
 from sasgeo_bench.flights.log_table import read_csv
+from sasgeo_bench.flights.log_ulog import read_ulog
 from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum
@@ -26,10 +28,11 @@ from sasgeo_bench.regions.region import Region
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SUFFIXES: Final = (".gpx", ".kml", ".csv", ".pos", ".tum", ".txt", ".tum.gz", ".txt.gz")
+_TUM: Final = (".tum", ".txt", ".tum.gz", ".txt.gz")
+_READERS: Final = MappingProxyType({".gpx": read_gpx, ".kml": read_kml, ".kmz": read_kml, ".ulg": read_ulog})
+SUFFIXES: Final = (*_READERS, ".csv", ".pos", *_TUM)
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
-_TUM: Final = SUFFIXES[4:]
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
@@ -62,10 +65,9 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
 def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     suffix = path.suffix.lower()
     is_table = suffix in (".csv", ".pos")
-    reader = {".gpx": read_gpx, ".kml": read_kml}.get(suffix)
+    reader = _READERS.get(suffix)
     if reader is None and not is_table:
-        mend = "unzip a .kmz, export a .ulg by ulog2csv of pyulog"
-        raise FlightError(f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are ({mend})")
+        raise FlightError(f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are")
     if facts.axes is not None:
         raise _meaningless(path, "is no TUM file", "--axes")
     if reader is None:

@@ -62,6 +62,7 @@ class FlightOptions(Options):
     ] = None
     place_unit: Annotated[PlaceUnit | None, typer.Option(help="of latitude and longitude (e7: 1e-7 degrees)")] = None
     axes: AxesFlag = None
+    vehicle: Annotated[int | None, typer.Option(help="system id of the vehicle in a .tlog of several")] = None
 
     @property
     def facts(self) -> LogFacts:
@@ -73,6 +74,7 @@ class FlightOptions(Options):
             place_unit=self.place_unit,
             axes=self.axes,
             speed_mps=self.speed_mps,
+            vehicle=self.vehicle,
         )
 
 

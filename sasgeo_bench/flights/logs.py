@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
+from sasgeo_bench.flights.log_dataflash import read_dataflash
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
 from sasgeo_bench.flights.log_table import read_csv
+from sasgeo_bench.flights.log_telemetry import read_tlog
 from sasgeo_bench.flights.log_ulog import read_ulog
 from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
@@ -29,8 +31,17 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 _TUM: Final = (".tum", ".txt", ".tum.gz", ".txt.gz")
-_READERS: Final = MappingProxyType({".gpx": read_gpx, ".kml": read_kml, ".kmz": read_kml, ".ulg": read_ulog})
-SUFFIXES: Final = (*_READERS, ".csv", ".pos", *_TUM)
+_READERS: Final = MappingProxyType(
+    {
+        ".gpx": read_gpx,
+        ".kml": read_kml,
+        ".kmz": read_kml,
+        ".ulg": read_ulog,
+        ".bin": read_dataflash,
+        ".log": read_dataflash,
+    }
+)
+SUFFIXES: Final = (*_READERS, ".tlog", ".csv", ".pos", *_TUM)
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
@@ -66,10 +77,15 @@ def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     suffix = path.suffix.lower()
     is_table = suffix in (".csv", ".pos")
     reader = _READERS.get(suffix)
-    if reader is None and not is_table:
+    if reader is None and not is_table and suffix != ".tlog":
         raise FlightError(f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are")
     if facts.axes is not None:
         raise _meaningless(path, "is no TUM file", "--axes")
+    if facts.vehicle is not None and suffix != ".tlog":
+        raise _meaningless(path, "is no telemetry log", "--vehicle")
+    if suffix == ".tlog":
+        facts.check_untold(path)
+        return read_tlog(path, vehicle=facts.vehicle)
     if reader is None:
         # What is not read has no unit to be asked for.
         return read_csv(path, replace(facts, height_unit="none") if has_height else facts)

@@ -351,7 +351,9 @@ def first_with_fixes(source: LogSource, candidates: Sequence[Fixes], what: str) 
 
 
 @contextmanager
-def library(source: LogSource, faults: tuple[type[Exception], ...]) -> Iterator[None]:
+def library(
+    source: LogSource, faults: tuple[type[Exception], ...], *, mend: str = "copy or download it anew"
+) -> Iterator[None]:
     """Keep a library quiet, which prints what it meets, and turn its faults into one line."""
     try:
         with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
@@ -359,7 +361,7 @@ def library(source: LogSource, faults: tuple[type[Exception], ...]) -> Iterator[
     except FlightError:
         raise
     except faults as error:
-        raise source.fault(f"cannot be read as such a log ({message_of(error)}): copy or download it anew") from error
+        raise source.fault(f"cannot be read as such a log ({message_of(error)}): {mend}") from error
 
 
 @contextmanager

@@ -38,11 +38,12 @@ Columns = Mapping[str, NDArray[Any]]
 
 _RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
 _ESTIMATE: Final = "vehicle_global_position"
+PLACES: Final = (*_RECEIVERS, _ESTIMATE)
 _LOCAL: Final = "vehicle_local_position"
 _HOME: Final = "home_position"
 _LANDED: Final = "vehicle_land_detected"
 _ATTITUDE: Final = "vehicle_attitude"
-_TOPICS: Final = (*_RECEIVERS, _ESTIMATE, _LOCAL, _HOME, _LANDED, _ATTITUDE)
+_TOPICS: Final = (*PLACES, _LOCAL, _HOME, _LANDED, _ATTITUDE)
 _E7: Final = 1e7
 # What pyulog raises on bytes that are no log.
 _FAULTS: Final = (struct.error, ValueError, KeyError, IndexError, TypeError, OverflowError, AttributeError, MemoryError)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
+from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
 from sasgeo_bench.flights.log_dataflash import read_dataflash
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
 from sasgeo_bench.flights.log_table import read_csv
@@ -41,7 +42,9 @@ _READERS: Final = MappingProxyType(
         ".log": read_dataflash,
     }
 )
-SUFFIXES: Final = (*_READERS, ".tlog", ".csv", ".pos", *_TUM)
+_TABLES: Final = (".csv", ".pos")
+_TELEMETRY: Final = ".tlog"
+SUFFIXES: Final = (*_READERS, _TELEMETRY, *BAGS, *_TABLES, *_TUM)
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
@@ -75,22 +78,19 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
 
 def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     suffix = path.suffix.lower()
-    is_table = suffix in (".csv", ".pos")
-    reader = _READERS.get(suffix)
-    if reader is None and not is_table and suffix != ".tlog":
+    reader = read_bag if is_bag(path) else _READERS.get(suffix)
+    is_table, is_telemetry = suffix in _TABLES, suffix == _TELEMETRY
+    if reader is None and not is_table and not is_telemetry:
         raise FlightError(f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are")
     if facts.axes is not None:
         raise _meaningless(path, "is no TUM file", "--axes")
-    if facts.vehicle is not None and suffix != ".tlog":
+    if facts.vehicle is not None and not is_telemetry:
         raise _meaningless(path, "is no telemetry log", "--vehicle")
-    if suffix == ".tlog":
-        facts.check_untold(path)
-        return read_tlog(path, vehicle=facts.vehicle)
-    if reader is None:
+    if is_table:
         # What is not read has no unit to be asked for.
         return read_csv(path, replace(facts, height_unit="none") if has_height else facts)
     facts.check_untold(path)
-    return reader(path)
+    return read_tlog(path, vehicle=facts.vehicle) if reader is None else reader(path)
 
 
 def _meaningless(path: Path, why: str, option: str) -> FlightError:

@@ -234,3 +234,119 @@ def tlog(flown: Flown, *, systems: Sequence[int] = (1,), is_v1: bool = False, la
     station = common.MAVLink(None, srcSystem=255, srcComponent=190)
     packets.append((packets[0][0], bytes(common.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(station))))
     return b"".join(stamp.to_bytes(8, "big") + one for stamp, one in sorted(packets, key=lambda item: item[0]))
+
+
+# Bags
+
+NAV_SAT = "sensor_msgs/msg/NavSatFix"
+PX4_TYPES = {
+    "SensorGps": (
+        "uint64 timestamp\nfloat64 latitude_deg\nfloat64 longitude_deg\nfloat64 altitude_msl_m\nfloat32 eph\n"
+        "uint8 fix_type\nuint64 time_utc_usec"
+    ),
+    "VehicleGpsPosition": (
+        "uint64 timestamp\nint32 lat\nint32 lon\nint32 alt\nfloat32 eph\nuint8 fix_type\nuint64 time_utc_usec"
+    ),
+    "VehicleAttitude": "uint64 timestamp\nfloat32[4] q",
+    "VehicleLocalPosition": "uint64 timestamp\nfloat32 z\nbool z_valid",
+    "HomePosition": "uint64 timestamp\nfloat32 z",
+}
+MORE_TYPES = {
+    "foxglove_msgs/msg/LocationFix": (
+        "builtin_interfaces/Time timestamp\nstring frame_id\nfloat64 latitude\nfloat64 longitude\nfloat64 altitude"
+    ),
+    "geographic_msgs/msg/GeoPoint": "float64 latitude\nfloat64 longitude\nfloat64 altitude",
+    "geographic_msgs/msg/GeoPointStamped": "std_msgs/Header header\ngeographic_msgs/GeoPoint position",
+} | {f"px4_msgs/msg/{name}": text for name, text in PX4_TYPES.items()}
+
+Message = tuple[str, str, int, Mapping[str, object]]  # topic, type, nanoseconds of the recorder, fields
+
+
+def bag(path: Path, messages: Sequence[Message], *, topics: Sequence[tuple[str, str]] = ()) -> Path:
+    """A bag of ROS 1 (.bag), or of ROS 2 as a folder of MCAP (.mcap) or of SQLite (.db3); returns what is read."""
+    from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - only where it is installed
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
+
+    is_first = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if is_first else Stores.ROS2_HUMBLE)
+    for name, text in MORE_TYPES.items():
+        store.register(get_types_from_msg(text, name))
+    plugin = rosbag2.StoragePlugin.MCAP if path.suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
+    folder = path.with_suffix("")
+    writer = rosbag1.Writer(path) if is_first else rosbag2.Writer(folder, version=9, storage_plugin=plugin)
+    serialize = store.serialize_ros1 if is_first else store.serialize_cdr
+    with writer:
+        kinds = dict.fromkeys([*topics, *((topic, kind) for topic, kind, _, _ in messages)])
+        open_ones = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds}
+        for topic, kind, stamp_ns, fields in messages:
+            writer.write(open_ones[topic], stamp_ns, serialize(_message_of(store, kind, fields), kind))
+    return path if is_first else folder
+
+
+def _message_of(store: object, kind: str, fields: Mapping[str, object]) -> object:
+    """A message of a type; fields that are not named are 0, empty, or of their own type."""
+    values = {}
+    for name, (node, what) in store.fielddefs[kind][1]:  # type: ignore[attr-defined]
+        inner = fields.get(name)
+        if node == 1 and what[0] != "string":  # a number
+            values[name] = 0 if inner is None else inner
+        elif node == 1:
+            values[name] = inner or ""
+        elif node == 2:  # a message
+            values[name] = _message_of(store, what, inner or {})  # type: ignore[arg-type]
+        else:
+            (_, (number, _)), length = what
+            values[name] = np.zeros(length, _NUMPY[number]) if inner is None else np.array(inner, _NUMPY[number])
+    return store.types[kind](**values)  # type: ignore[attr-defined]
+
+
+_NUMPY = {"float32": np.float32, "float64": np.float64}
+
+
+def stamp(time_s: float, *, start_ns: int = START_S * 10**9) -> dict[str, int]:
+    """A time of a header."""
+    total_ns = start_ns + round(time_s * 1e9)
+    return {"sec": total_ns // 10**9, "nanosec": total_ns % 10**9}
+
+
+def mavros_messages(flown: Flown, *, late_s: float = 0.03, status: int = 0) -> list[Message]:
+    """What mavros publishes of a flight, each message recorded late."""
+    messages: list[Message] = []
+    for at, time_s in enumerate(flown.time_s.tolist()):
+        lon, lat, up = float(flown.lon_deg[at]), float(flown.lat_deg[at]), float(flown.height_m[at])
+        recorded_ns = START_S * 10**9 + round((time_s + late_s) * 1e9)
+        header = {"stamp": stamp(time_s)}
+        place = {"latitude": lat, "longitude": lon, "altitude": GROUND_M + 47 + up}
+        fix = {"header": header, "status": {"status": status}, **place, "position_covariance_type": 2}
+        fix["position_covariance"] = [2.25, 0, 0, 0, 2.25, 0, 0, 0, 9]
+        half = np.radians(90 - flown.yaw_deg[at]) / 2  # counter-clockwise from east
+        turn_of = {"w": float(np.cos(half)), "x": 0.0, "y": 0.0, "z": float(np.sin(half))}
+        messages += [
+            ("/mavros/global_position/raw/fix", NAV_SAT, recorded_ns, fix),
+            ("/mavros/global_position/global", NAV_SAT, recorded_ns, fix | {"latitude": lat + 1e-4}),
+            ("/mavros/global_position/rel_alt", "std_msgs/msg/Float64", recorded_ns, {"data": up}),
+            ("/mavros/imu/data", "sensor_msgs/msg/Imu", recorded_ns, {"header": header, "orientation": turn_of}),
+        ]
+    return messages
+
+
+def px4_messages(flown: Flown, *, is_new: bool = True) -> list[Message]:
+    """What PX4 publishes over its bridge, stamped by its own clock."""
+    kind = "SensorGps" if is_new else "VehicleGpsPosition"
+    names = [line.split()[1] for line in PX4_TYPES[kind].splitlines()]
+    topics = px4_topics(flown, is_new=is_new)
+    messages: list[Message] = []
+    tables = {
+        "vehicle_gps_position": kind,
+        "vehicle_attitude": "VehicleAttitude",
+        "vehicle_local_position": "VehicleLocalPosition",
+        "home_position": "HomePosition",
+    }
+    for topic, name in tables.items():
+        fields, rows = topics[topic, 0]
+        columns = [one.split(" ")[1] for one in fields.strip(";").split(";")]
+        for row in rows:
+            values = dict(zip(columns, [row[0], row[1:]] if name == "VehicleAttitude" else row, strict=True))
+            kept = {key: value for key, value in values.items() if key in (*names, "q", "z", "z_valid")}
+            messages.append((f"/fmu/out/{topic}", f"px4_msgs/msg/{name}", START_S * 10**9 + int(row[0]) * 1000, kept))
+    return sorted(messages, key=lambda one: one[2])

@@ -4,6 +4,7 @@
 import datetime as dt
 import gzip
 import io
+import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +17,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights import log_points
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import read_flight, read_log
@@ -469,3 +470,19 @@ def test_wishes_that_cannot_be_are_refused(written: Callable, region: Region, wi
     path = written("a.csv", _table(region, _across(region)))
     with pytest.raises(FlightError, match=next(iter(wish)).replace("_m", "-m")):
         read_flight(path, region, **({"height_m": 100.0} | wish))
+
+
+# Autopilots
+
+
+@pytest.mark.parametrize(
+    ("name", "library"), [("a.ulg", "pyulog"), ("a.bin", "pymavlink"), ("a.tlog", "pymavlink"), ("a.bag", "rosbags")]
+)
+def test_a_log_whose_library_is_not_installed_names_the_extra(
+    written: Callable, monkeypatch: pytest.MonkeyPatch, name: str, library: str
+) -> None:
+    for module in [one for one in sys.modules if one.partition(".")[0] == library]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ConfigError, match=rf"needs the package {library}: pip install 'sasgeo-bench\[logs\]'"):
+        read_log(written(name, ""))

@@ -8,8 +8,8 @@ its `imu/data`. Times are the stamps of the headers, else those of the recorder.
 """
 
 from array import array
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
@@ -59,6 +59,9 @@ _OF_PX4: Final = MappingProxyType(
         f"{_PX4}HomePosition": "home_position",
         f"{_PX4}VehicleLandDetected": "vehicle_land_detected",
         f"{_PX4}VehicleAttitude": "vehicle_attitude",
+        f"{_PX4}VehicleOdometry": "vehicle_odometry",
+        f"{_PX4}EstimatorStatusFlags": "estimator_status_flags",
+        f"{_PX4}EstimatorStatus": "estimator_status",
     }
 )
 _FIX: Final = "sensor_msgs/msg/NavSatFix"
@@ -102,6 +105,21 @@ def read_bag(path: Path) -> FlightLog:
     FlightError
         If the bag has no places, or is damaged: one that was cut off has no index, and its own tool makes it anew.
     """
+    with _opened(path) as bag, known_fields(bag.source):
+        topics = _px4_topics(bag, log_ulog.TOPICS)
+        has_px4 = any(topic in log_ulog.PLACES for topic, _ in topics.topics)
+        streams = log_ulog.streams_of(topics) if has_px4 else _ros_streams(bag)
+    return flight_of(bag.source, streams)
+
+
+def read_topics(path: Path, names: Collection[str]) -> log_ulog.Topics:
+    """Read PX4's own messages of a bag, as `log_ulog.read_topics` reads a ULog; raise as `read_bag` does."""
+    with _opened(path) as bag:
+        return _px4_topics(bag, names)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator["_Bag"]:
     try:
         from rosbags.highlevel import AnyReader  # noqa: PLC0415 - only where it is installed
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
@@ -114,10 +132,7 @@ def read_bag(path: Path) -> FlightLog:
     with ExitStack() as stack:
         with library(source, _FAULTS, mend=_MEND):
             reader = stack.enter_context(AnyReader([path], default_typestore=get_typestore(Stores.LATEST)))
-        bag = _Bag(source=source, reader=reader)
-        with known_fields(source):
-            streams = _px4_streams(bag) or _ros_streams(bag)
-    return flight_of(source, streams)
+        yield _Bag(source=source, reader=reader)
 
 
 _FAULTS: Final = (Exception,)  # asserts and errors of each storage and of every type
@@ -189,39 +204,42 @@ _Maker = Callable[[LogSource, _Table, Floats], Fixes]
 # PX4
 
 
-def _px4_streams(bag: _Bag) -> Streams | None:
-    """Return what PX4's own messages say, as a ULog of them; none if the bag has no places of them."""
+def _px4_topics(bag: _Bag, names: Collection[str]) -> log_ulog.Topics:
+    """Return what PX4's own messages say, as topics of a ULog."""
     topics: dict[tuple[str, int], Mapping[str, NDArray[Any]]] = {}
-    names: list[str] = []
+    told: list[str] = []
     for connection in bag.connections(_OF_PX4):
-        # the receiver that PX4 chose is of the type of any
-        topic = next((one for one in _OF_PX4.values() if connection.topic.endswith(one)), _OF_PX4[connection.msgtype])
+        # of one type are the receiver that PX4 chose and any other, and poses of a camera and of the estimator
+        topic = next((one for one in names if connection.topic.endswith(f"/{one}")), _OF_PX4[connection.msgtype])
+        if topic not in names:
+            continue
         number = sum(one == topic for one, _ in topics)
         fields = [name for name, _ in bag.reader.typestore.fielddefs[connection.msgtype][1]]
         kept = [name for name in fields if name in _NUMBERS]
         table = bag.table(connection, kept)
-        columns = dict(zip(_spread(kept, table.values.shape[1]), table.values.T, strict=True))
-        topics[topic, number] = columns
-        names.append(f"{connection.topic} is {topic} {number}")
-    if not any(topic in log_ulog.PLACES for topic, _ in topics):
-        return None
-    notes = (f"topics: {'; '.join(names)}",)
-    return log_ulog.streams_of(log_ulog.Topics(source=bag.source, topics=topics, notes=notes))
+        topics[topic, number] = dict(zip(_spread(kept), table.values.T, strict=True))
+        told.append(f"{connection.topic} is {topic} {number}")
+    return log_ulog.Topics(source=bag.source, topics=topics, notes=(f"topics: {'; '.join(told)}",) if told else ())
 
 
 # Fields of PX4's messages that are read, by any of its versions.
 _NUMBERS: Final = frozenset(
     {
         *("timestamp", "time_utc_usec", "lat", "lon", "alt", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph"),
-        *("fix_type", "lat_lon_valid", "z", "z_valid", "landed", "q"),
+        *("fix_type", "lat_lon_valid", "x", "y", "z", "xy_valid", "z_valid", "landed", "q", "position"),
+        *("control_mode_flags", *log_ulog.FUSING),
     }
 )
 
 
-def _spread(names: Sequence[str], width: int) -> list[str]:
-    """Return the names of columns, of which a quaternion has four."""
-    columns = [column for name in names for column in ([f"q[{at}]" for at in range(4)] if name == "q" else [name])]
-    return columns[:width]
+def _spread(names: Sequence[str]) -> list[str]:
+    """Return the names of columns, of which a quaternion has four and a place three."""
+    sizes = {"q": 4, "position": 3}
+    return [
+        column
+        for name in names
+        for column in ([f"{name}[{at}]" for at in range(sizes[name])] if name in sizes else [name])
+    ]
 
 
 # ROS

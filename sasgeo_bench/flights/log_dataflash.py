@@ -8,12 +8,13 @@ second), height `POS.RelHomeAlt`, attitude `ATT`. https://ardupilot.org/copter/d
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.paths import plain_file
@@ -23,11 +24,13 @@ from sasgeo_bench.flights.log_streams import (
     LEAST_FIX,
     MOST_LOG_BYTES,
     Clock,
+    Estimate,
     Fixes,
     Stream,
     Streams,
     first_with_fixes,
     flight_of,
+    free_stretches,
     known_fields,
     library,
     quaternions_of_angles,
@@ -44,6 +47,7 @@ class Messages:
     source: LogSource
     messages: dict[str, dict[str, Floats]]
     notes: tuple[str, ...] = ()
+    parameters: dict[str, float] = field(default_factory=dict)
 
     def instances(self, name: str, field: str = "I") -> Iterator[tuple[str, dict[str, Floats]]]:
         """Yield the messages of a name, split by the field that numbers instances, in its order."""
@@ -90,11 +94,12 @@ def read_messages(path: Path, names: Sequence[str]) -> Messages:
         with plain_file(path).open("rb") as file:
             is_binary = file.read(2) == bytes((0xA3, 0x95))
         if not is_binary:
-            return Messages(source=source, messages=_of_text(DFReader.DFReader_text(str(path)), names))
+            reader = DFReader.DFReader_text(str(path))
+            return Messages(source=source, messages=_of_text(reader, names), parameters=dict(reader.params))
         with DFReader.DFReader_binary(str(path)) as reader:
             found = {name: columns for name in names if (columns := _of_binary(reader, name))}
-            notes = tuple(_damages(reader))
-    return Messages(source=source, messages=found, notes=notes)
+            notes, parameters = tuple(_damages(reader)), dict(reader.params)
+    return Messages(source=source, messages=found, notes=notes, parameters=parameters)
 
 
 @contextmanager
@@ -173,6 +178,13 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float)
 
 
+OF_DRIFT: Final = ("GPS", "GPS2", "GPA", "ATT", "XKF1", "XKF4", "NKF1", "NKF4", "VISP", "VISO")
+# Bits of the status of the filter, and the source that is a receiver: AP_NavEKF, AP_NavEKF_Source of ArduPilot.
+_HELD: Final = 7
+_USING_GPS: Final = 13
+_OF_GPS: Final = 3
+
+
 def read_dataflash(path: Path) -> FlightLog:
     """Read the flight of a DataFlash log; raise `FlightError` if it has no places, or is not sound."""
     messages = read_messages(path, ("GPS", "GPS2", "GPA", "POS", "ATT"))
@@ -213,6 +225,70 @@ def fixes_of(messages: Messages) -> tuple[Fixes, tuple[str, ...]]:
         )
         found.append(fixes)
     return first_with_fixes(messages.source, found, "GPS")
+
+
+def estimates_of(messages: Messages) -> list[Estimate]:
+    """Return what may be odometry: a camera's poses (`VISP`, else `VISO` summed up), else the estimator's own.
+
+    Raise `FlightError` if the log does not say when the estimator fused a receiver.
+    """
+    source = messages.source
+    if (columns := messages.messages.get("VISP")) is not None:
+        turns = quaternions_of_angles(columns["Y"], columns["P"], columns["R"])
+        poses = np.column_stack([*(columns[key] for key in ("PX", "PY", "PZ")), turns])
+        return [Estimate(poses=Stream.of(source, "VISP", seconds(columns), poses))]
+    if (columns := messages.messages.get("VISO")) is not None:
+        return [Estimate(poses=Stream.of(source, "VISO", seconds(columns), _summed(columns)))]
+    for poses_of, flags_of in (("XKF1", "XKF4"), ("NKF1", "NKF4")):
+        cores = dict(messages.instances(poses_of, "C"))
+        if not cores:
+            continue
+        flags = messages.messages.get(flags_of)
+        if flags is None or "SS" not in flags:
+            raise source.fault(
+                f"{flags_of} is not logged, so nobody knows when {poses_of} fused GNSS: it is no odometry; log it, or "
+                "take a profile"
+            )
+        # the core that flew most of the way
+        primary = f"{poses_of} {np.median(flags['PI']):.0f}" if "PI" in flags else ""
+        name = primary if primary in cores else next(iter(cores))
+        _check_sources(messages, name)
+        told = [(seconds(one), _is_fused(one["SS"])) for _, one in messages.instances(flags_of, "C")]
+        columns = cores[name]
+        own = np.full((len(columns["PN"]), 4), np.nan)
+        poses = np.column_stack([*(columns[key] for key in ("PN", "PE", "PD")), own])
+        stream = Stream.of(source, name, seconds(columns), poses)
+        return [Estimate(poses=stream, free_s=free_stretches(told), fused=f"{flags_of}.SS")]
+    return []
+
+
+def _is_fused(status: Floats) -> NDArray[np.bool_]:
+    """Return whether a receiver is fused, or the estimate is held in place, which is no odometry either."""
+    return np.asarray(status.astype(np.uint32) & (1 << _USING_GPS | 1 << _HELD)) > 0
+
+
+def _check_sources(messages: Messages, name: str) -> None:
+    """Raise `FlightError` if the velocity of a receiver is fused where its position is not: no flag tells so."""
+    for number in (1, 2, 3):
+        place, speed = (messages.parameters.get(f"EK3_SRC{number}_{what}") for what in ("POSXY", "VELXY"))
+        if speed == _OF_GPS and place not in (_OF_GPS, None):
+            raise messages.source.fault(
+                f"{name} fused the velocity of the receiver (EK3_SRC{number}_VELXY 3), and is a copy of the truth in "
+                "part, no odometry: take a profile"
+            )
+
+
+def _summed(columns: Columns) -> Floats:
+    """Return poses out of steps in the axes of the body before each, from a level one that heads north."""
+    turn, place_m = Rotation.identity(), np.zeros(3)
+    poses = []
+    steps = np.column_stack([columns[f"PosD{axis}"] for axis in "XYZ"])
+    angles = Rotation.from_rotvec(np.column_stack([columns[f"AngD{axis}"] for axis in "XYZ"]))
+    for at, step_m in enumerate(steps):
+        place_m = place_m + turn.apply(step_m)
+        turn = turn * angles[at]
+        poses.append([*place_m, *turn.as_quat()])
+    return np.array(poses)
 
 
 def _streams_of(messages: Messages) -> Streams:

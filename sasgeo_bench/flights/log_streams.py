@@ -29,9 +29,10 @@ LEAST_FIX: Final = 3  # of MAVLink, PX4 and ArduPilot alike: a place in three di
 
 _MOST_APART_S: Final = 1.0  # from a fix to a height or an attitude that is its own
 _JUMP_S: Final = 1.0  # of a clock; what is written late is less out of order
+_SILENT_S: Final = 5.0  # PX4 sends its flags each second, ArduPilot ten times
 _STILL_S: Final = 2.0  # by which two clocks of a flight may part
 # North, east, down out of east, north, up; forward, right, down out of forward, left, up.
-_NED_OF_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+NED_OF_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FRD_OF_FLU: Final = np.diag([1.0, -1.0, -1.0])
 
 
@@ -195,6 +196,61 @@ class Streams:
     notes: tuple[str, ...] = field(default=())
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimate:
+    """Poses of an estimator in a log, and when no receiver was fused into them.
+
+    Parameters
+    ----------
+    poses : Stream
+        North, east, down in metres from any place, then quaternions x, y, z, w from the body to that frame, shape
+        (N, 7). A frame may be turned about the vertical. Quaternions are not a number where the estimate has none of
+        its own: it is then turned as the vehicle is.
+    free_s : tuple of pairs of float
+        From when to when no receiver was fused, seconds of the log's clock.
+    fused : str
+        What tells so, for messages: flags, or what kind of estimator it is.
+    """
+
+    poses: Stream
+    free_s: tuple[tuple[float, float], ...] = ((-np.inf, np.inf),)
+    fused: str = "of a camera"
+
+
+def free_stretches(flags: Sequence[tuple[Floats, Bools]]) -> tuple[tuple[float, float], ...]:
+    """Return from when to when no instance of an estimator fused a receiver.
+
+    Parameters
+    ----------
+    flags : sequence of (ndarray, ndarray)
+        Of each instance times, seconds, in order, and whether a receiver was fused, both shape (N,).
+
+    Returns
+    -------
+    tuple of pairs of float
+        From the first to the last of flags in a row that say so. Between one that does and one that does not nobody
+        knows, nor where none came for five seconds.
+
+    Examples
+    --------
+    >>> free_stretches([(np.array([0.0, 1.0, 2.0, 3.0, 4.0, 60.0]), np.array([1, 0, 0, 1, 0, 0], dtype=bool))])
+    ((1.0, 2.0),)
+    """
+    time_s = np.unique(np.concatenate([times for times, _ in flags]))
+    is_fused = np.zeros(len(time_s), dtype=bool)
+    for times, told in flags:  # what an instance said last, and says next
+        last = np.maximum(np.searchsorted(times, time_s, side="right") - 1, 0)
+        coming = np.minimum(np.searchsorted(times, time_s), len(times) - 1)
+        is_fused |= told[last] | told[coming]
+    found = []
+    edges = np.flatnonzero(np.diff(time_s) > _SILENT_S) + 1
+    for part, told in zip(np.split(time_s, edges), np.split(is_fused, edges), strict=True):
+        steps = np.diff(np.concatenate([[True], told, [True]]).astype(np.int8))
+        starts, ends = np.flatnonzero(steps < 0).tolist(), np.flatnonzero(steps > 0).tolist()
+        found += [(float(part[at]), float(part[end - 1])) for at, end in zip(starts, ends, strict=True) if end - at > 1]
+    return tuple(found)
+
+
 def quaternions_of_ned(w: Floats, x: Floats, y: Floats, z: Floats) -> Floats:
     """Return quaternions as streams have them, those of no length as not a number, shape (N, 4)."""
     table = np.column_stack([x, y, z, w]).astype(np.float64)
@@ -216,7 +272,7 @@ def quaternions_of_enu(w: Floats, x: Floats, y: Floats, z: Floats) -> Floats:
     turns = Rotation.from_quat(table[is_known]).as_matrix() if is_known.any() else np.empty((0, 3, 3))
     turned = np.full_like(table, np.nan)
     if len(turns):
-        turned[is_known] = Rotation.from_matrix(_NED_OF_ENU @ turns @ _FRD_OF_FLU).as_quat()
+        turned[is_known] = Rotation.from_matrix(NED_OF_ENU @ turns @ _FRD_OF_FLU).as_quat()
     return turned
 
 

@@ -23,11 +23,13 @@ from sasgeo_bench.flights.log_streams import (
     LEAST_FIX,
     MOST_LOG_BYTES,
     Clock,
+    Estimate,
     Fixes,
     Stream,
     Streams,
     first_with_fixes,
     flight_of,
+    free_stretches,
     known_fields,
     library,
     quaternions_of_ned,
@@ -42,8 +44,14 @@ PLACES: Final = (*_RECEIVERS, _ESTIMATE)
 _LOCAL: Final = "vehicle_local_position"
 _HOME: Final = "home_position"
 _LANDED: Final = "vehicle_land_detected"
+VISUAL: Final = "vehicle_visual_odometry"
+_FLAGS: Final = ("estimator_status_flags", "estimator_status")
+# Of a receiver's position, heading and velocity, and of an auxiliary global position, under all their names.
+FUSING: Final = ("cs_gps", "cs_gnss_pos", "cs_gps_yaw", "cs_gnss_yaw", "cs_gnss_vel", "cs_aux_gpos")
+_FUSING_BITS: Final = (2, 22, 38, 44)  # https://docs.px4.io/main/en/msg_docs/EstimatorStatus
 _ATTITUDE: Final = "vehicle_attitude"
-_TOPICS: Final = (*PLACES, _LOCAL, _HOME, _LANDED, _ATTITUDE)
+TOPICS: Final = (*PLACES, _LOCAL, _HOME, _LANDED, _ATTITUDE)
+OF_DRIFT: Final = (*_RECEIVERS, _LOCAL, _ATTITUDE, VISUAL, *_FLAGS)
 _E7: Final = 1e7
 # What pyulog raises on bytes that are no log.
 _FAULTS: Final = (struct.error, ValueError, KeyError, IndexError, TypeError, OverflowError, AttributeError, MemoryError)
@@ -130,23 +138,23 @@ def read_topics(path: Path, names: tuple[str, ...]) -> Topics:
 
 def read_ulog(path: Path) -> FlightLog:
     """Read the flight of a ULog file; raise `FlightError` if it has no places, or is not sound."""
-    topics = read_topics(path, _TOPICS)
+    topics = read_topics(path, TOPICS)
     with known_fields(topics.source):
         streams = streams_of(topics)
     return flight_of(topics.source, streams)
 
 
+def fixes_of(topics: Topics) -> tuple[Fixes, tuple[str, ...]]:
+    """Return the fixes of the first receiver that has two, else of the estimate, and a note on the others."""
+    source = topics.source
+    receivers = [_fixes(source, *one) for name in _RECEIVERS for one in topics.instances(name)]
+    estimates = [_estimated(source, *one) for one in topics.instances(_ESTIMATE)]
+    return first_with_fixes(source, [*receivers, *estimates], f"{', '.join(_RECEIVERS)} or {_ESTIMATE}")
+
+
 def streams_of(topics: Topics) -> Streams:
     """Return what a flight is made of, out of the topics of a ULog file."""
-    source = topics.source
-    fixes, notes = first_with_fixes(
-        source,
-        [
-            *(_fixes(source, *one) for name in _RECEIVERS for one in topics.instances(name)),
-            *(_estimated(source, *one) for one in topics.instances(_ESTIMATE)),
-        ],
-        f"{', '.join(_RECEIVERS)} or {_ESTIMATE}",
-    )
+    fixes, notes = fixes_of(topics)
     heights = _heights(topics)
     if heights is None:
         notes += (f"no height: neither {_HOME} nor a take-off tells what {_LOCAL} counts from",)
@@ -219,6 +227,52 @@ def _heights(topics: Topics) -> Stream | None:
             ground_m = z_m[int(before[-1])]
             return Stream.of(topics.source, f"{name} from take-off by {other}", time_s, (ground_m - z_m)[:, None])
     return None
+
+
+def estimates_of(topics: Topics) -> list[Estimate]:
+    """Return what may be odometry: a camera's poses, else the estimator's own.
+
+    Raise `FlightError` if the log does not say when the estimator fused a receiver.
+    """
+    found = []
+    for name, columns in topics.instances(VISUAL):
+        is_old = "x" in columns  # before PX4 1.14
+        keys = ["x", "y", "z"] if is_old else [f"position[{at}]" for at in range(3)]
+        turns = quaternions_of_ned(*(columns[f"q[{at}]"] for at in range(4)))
+        poses = np.column_stack([*(columns[key] for key in keys), turns])
+        found.append(Estimate(poses=Stream.of(topics.source, name, seconds(columns), poses)))
+    local = topics.first(_LOCAL)
+    if found or local is None:
+        return found
+    name, columns = local
+    free_s, fused = _without_receiver(topics)
+    is_valid = np.asarray(columns.get("xy_valid", np.ones(len(columns["timestamp"]))), dtype=bool)
+    poses = np.column_stack([*(columns[key] for key in ("x", "y", "z")), np.full((len(is_valid), 4), np.nan)])
+    stream = Stream.of(topics.source, name, seconds(columns)[is_valid], poses[is_valid])
+    return [Estimate(poses=stream, free_s=free_s, fused=fused)]
+
+
+def _without_receiver(topics: Topics) -> tuple[tuple[tuple[float, float], ...], str]:
+    """Return when no instance of the estimator fused a receiver, and what tells so."""
+    found: list[tuple[Floats, NDArray[np.bool_]]] = []
+    name = ""
+    for name in _FLAGS:
+        for _, columns in topics.instances(name):
+            if "control_mode_flags" in columns:
+                told = np.asarray(columns["control_mode_flags"]).astype(np.uint64)
+                is_fused = (told & np.uint64(sum(1 << bit for bit in _FUSING_BITS))) > 0
+            else:
+                named = [np.asarray(columns[key], dtype=bool) for key in FUSING if key in columns]
+                is_fused = np.logical_or.reduce(named) if named else np.ones(len(columns["timestamp"]), dtype=bool)
+            found.append((seconds(columns), is_fused))
+        if found:
+            break
+    if not found:
+        raise topics.source.fault(
+            f"{' and '.join(_FLAGS)} are not logged, so nobody knows when {_LOCAL} fused GNSS: it is no odometry; log "
+            "them, or take a profile"
+        )
+    return free_stretches(found), name
 
 
 def _clock(topics: Topics) -> Clock | None:

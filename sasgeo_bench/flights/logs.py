@@ -215,6 +215,11 @@ def _check_near(log: FlightLog, path: Path, region: Region) -> None:
 def _on_grid(log: FlightLog, path: Path, epsg: int, speed_mps: float) -> Trajectory:
     """Return the points of a log in a projected CRS; without a heading yaw is 0."""
     up_m = log.height_m
+    if up_m is not None and (highest_m := float(up_m.max())) < LOWEST_M:
+        raise FlightError(
+            f"{path.name} never leaves the ground: {highest_m:.1f} m above it at most, {LOWEST_M:g} m are needed: take "
+            "another log, or say a height, as in --height-m 100"
+        )
     if up_m is None:
         why = "" if log.altitude_m is None else ", and its altitudes do not count from there"
         raise FlightError(f"{path.name} has no height above the ground{why}: say one, as in --height-m 100")

@@ -19,6 +19,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.preview import paint_evidence
 from sasgeo_bench.scoring.flights import SHARE_INSIDE
+from sasgeo_bench.scoring.relative_pose import relative_errors
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.sheet import Ground, bounds_of_m, flight_panels
@@ -109,6 +110,10 @@ def _facts(views: pd.DataFrame) -> list[tuple[str, str]]:
         ("accepted fixes", f"{accepted.sum()}, {(accepted & ~near).sum()} of them false"),
         ("error p50, p95", f"{p50_m:.1f} m, {p95_m:.1f} m"),
         ("ATE, nothing aligned", f"{ate_m:.1f} m"),
+        *(
+            (f"RPE over {one.length_m:g} m", f"{one.position_m:.1f} m, {one.yaw_deg:.1f} deg ({one.pairs} pairs)")
+            for one in relative_errors(views)
+        ),
     ]
 
 

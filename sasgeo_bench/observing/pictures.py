@@ -26,7 +26,7 @@ from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.grid import utm_epsg
-from sasgeo_bench.geometry.pose import Pose, bearing_deg, rotation
+from sasgeo_bench.geometry.pose import Pose, bearing_deg
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.regions.layers import find_bands, selected
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
@@ -267,17 +267,9 @@ def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
         heading_deg=sensor.yaw_deg if by else None,
         heading_by=by,
         scale_sigma=0.10,
-        camera=above_origin(sensor),
+        camera=sensor.above_origin(),
         height_m=height_m,
     )
-
-
-def above_origin(camera: Camera) -> Camera:
-    """Return a camera above the origin, in axes in which its picture's up is north."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(camera.yaw_deg)
-    a, b, c, d, e, f, g, h, i = (camera.matrix @ turn).ravel().round(15).tolist()
-    return replace(camera, east_m=0.0, north_m=0.0, rotation=(a, b, c, d, e, f, g, h, i))
 
 
 def _georeferenced(path: Path) -> OwnPicture | None:

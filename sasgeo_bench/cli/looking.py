@@ -15,9 +15,10 @@ from sasgeo_bench.boards.cases import case_pixels, count_cases, sample_cases, wr
 from sasgeo_bench.boards.flight_plots import flight_map_pixels
 from sasgeo_bench.boards.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
 from sasgeo_bench.boards.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
+from sasgeo_bench.cli.built_regions import find_built
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
-from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
+from sasgeo_bench.cli.targets import find_task, is_split, no_target
 from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.osm.taxonomy import load_taxonomy

@@ -33,7 +33,6 @@ _NEAR_PX: Final = (6.0, 3.0)  # within which matches agree with a fit: the first
 _MATCH_PX: Final = 1.0  # standard deviation of a match
 _INDEPENDENT: Final = 40  # matches that count at most: errors of neighbours are alike, by relief and by the lens
 _STILL: Final = 1e-4  # radians, and fraction of the height: what is believed to be exact
-_MOST_SIGMAS: Final = 4.0  # by which a belief may be wrong before the matches are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,7 +238,7 @@ class _Fit:
             numbers = least_squares(self._errors, numbers, args=(agrees,), loss="soft_l1").x
             agrees &= np.linalg.norm(self._off_px(numbers), axis=1) < near_px
         count = int(agrees.sum())
-        if count < _LEAST or np.abs(numbers[3:]).max() > _MOST_SIGMAS:
+        if count < _LEAST:
             return None
         fitted = least_squares(self._errors, numbers, args=(agrees,))
         jacobian, off = np.asarray(fitted.jac)[: 2 * count], fitted.fun[: 2 * count]

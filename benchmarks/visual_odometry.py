@@ -14,8 +14,10 @@ Errors are those of single steps, and of segments of at least 100 m as each way 
 
 import argparse
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Final
 
@@ -29,7 +31,7 @@ from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.flights.drift_profile import load_profile
 from sasgeo_bench.flights.odometry import draw_odometry
 from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.geometry.pose import bearing_deg, reckon, wrap_deg
+from sasgeo_bench.geometry.pose import bearing_deg, reckon, rotation, wrap_deg
 from sasgeo_bench.sensing.camera import Attitude, Camera
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import AerialImage
@@ -46,6 +48,7 @@ SEGMENT_M: Final = 100.0
 LEAST: Final = 20  # matches that agree, of the other ways
 WITHIN: Final = 7.81  # squared distance that holds 95 % of three numbers
 Moved = tuple[float, float, float]
+Moves = dict[str, list[Moved | None]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,6 +232,28 @@ WAYS: Final[dict[str, Callable[[AerialImage, AerialImage, Matches], Moved | None
 OURS: Final = "rigid, then fitted (`relative_motion`)"
 
 
+def follow(flown: Sequence[View], height_off: float, rng: np.random.Generator) -> tuple[Moves, list[bool]]:
+    """Return the steps of a flight by each way, and which of ours lie within the ellipsoid that they state."""
+    moves: Moves = {way: [] for way in (*WAYS, OURS)}
+    covered: list[bool] = []
+    for before, after in pairwise(shots(flown, height_off, rng)):
+        matches = match_images(before.image, after.image)
+        for way, find in WAYS.items():
+            moves[way].append(None if matches is None else find(before.image, after.image, matches))
+        motion = relative_motion(before.image, after.image)
+        if motion is None:
+            moves[OURS].append(None)
+            continue
+        moves[OURS].append((motion.right_m, motion.up_m, motion.turn_deg))
+        apart_m = after.camera.position_m[:2] - before.camera.position_m[:2]
+        turn_deg = after.camera.yaw_deg - before.camera.yaw_deg
+        off = np.array([motion.right_m, motion.up_m, wrap_deg(motion.turn_deg - turn_deg)])
+        off[:2] -= apart_m @ rotation(before.camera.yaw_deg)
+        covered.append(bool(off @ np.linalg.solve(np.reshape(motion.covariance, (3, 3)), off) < WITHIN))
+    moves["drawn, `vio-mono`"] = drawn([view.camera for view in flown], rng)
+    return moves, covered
+
+
 def main() -> None:
     """Fly, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -242,39 +267,18 @@ def main() -> None:
     print("| Region | Tilt, deg | Odometry | Steps | Lost, % | Step, % | Turn, deg | 100 m, % | Heading, deg |")
     print("|---|---:|---|---:|---:|---:|---:|---:|---:|")
     covered: list[bool] = []
-    for name in given.regions:
+    for name, tilt_deg in product(given.regions, given.tilt):
         region = sgb.read_region(given.out / "regions" / name)
-        for tilt_deg in given.tilt:
-            errors = {way: Errors() for way in (*WAYS, OURS, "drawn, `vio-mono`")}
-            for overlap in OVERLAPS:
-                rng = np.random.default_rng([given.seed, int(tilt_deg), int(100 * overlap)])
-                flown = fly(region, given.side, overlap, tilt_deg, rng)
-                cameras = [view.camera for view in flown]
-                moves: dict[str, list[Moved | None]] = {way: [] for way in (*WAYS, OURS)}
-                before: Shot | None = None
-                for shot in shots(flown, given.height, rng):
-                    if before is not None:
-                        matches = match_images(before.image, shot.image)
-                        for way, find in WAYS.items():
-                            moves[way].append(None if matches is None else find(before.image, shot.image, matches))
-                        motion = relative_motion(before.image, shot.image)
-                        moves[OURS].append(None if motion is None else (motion.right_m, motion.up_m, motion.turn_deg))
-                        if motion is not None:
-                            apart = shot.camera.position_m[:2] - before.camera.position_m[:2]
-                            yaw = math.radians(before.camera.yaw_deg)
-                            off = np.array([
-                                motion.right_m - apart @ [math.cos(yaw), -math.sin(yaw)],
-                                motion.up_m - apart @ [math.sin(yaw), math.cos(yaw)],
-                                float(wrap_deg(motion.turn_deg - shot.camera.yaw_deg + before.camera.yaw_deg)),
-                            ])  # fmt: skip
-                            spread = np.reshape(motion.covariance, (3, 3))
-                            covered.append(bool(off @ np.linalg.solve(spread, off) < WITHIN))
-                    before = shot
-                moves["drawn, `vio-mono`"] = drawn(cameras, rng)
-                for way, found in moves.items():
-                    errors[way].add(cameras, found)
-            for way, found_errors in errors.items():
-                print(f"| {name} | {tilt_deg:g} | {way} | {found_errors.row()} |", flush=True)
+        errors: defaultdict[str, Errors] = defaultdict(Errors)
+        for overlap in OVERLAPS:
+            rng = np.random.default_rng([given.seed, int(tilt_deg), int(100 * overlap)])
+            flown = fly(region, given.side, overlap, tilt_deg, rng)
+            moves, within = follow(flown, given.height, rng)
+            covered += within
+            for way, found in moves.items():
+                errors[way].add([view.camera for view in flown], found)
+        for way, found_errors in errors.items():
+            print(f"| {name} | {tilt_deg:g} | {way} | {found_errors.row()} |", flush=True)
     print(f"\nWithin its 95 % ellipsoid: {100 * np.mean(covered):.0f} % of {len(covered)} steps of {OURS}")
 
 

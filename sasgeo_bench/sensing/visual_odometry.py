@@ -83,6 +83,8 @@ class Motion:
 def relative_motion(before: AerialImage, after: AerialImage) -> Motion | None:
     """Return how the camera moved between two pictures of level ground; None if they show too little in common.
 
+    None as well of a camera that is believed to stand on the ground.
+
     Parameters
     ----------
     before, after : AerialImage
@@ -110,7 +112,8 @@ def relative_motion(before: AerialImage, after: AerialImage) -> Motion | None:
     >>> round(motion.right_m, 1), round(motion.up_m, 1), abs(round(motion.turn_deg, 1))
     (20.0, 15.0, 0.0)
     """
-    matches = match_images(before, after)
+    is_aloft = min(before.camera.height_m, after.camera.height_m) > 0
+    matches = match_images(before, after) if is_aloft else None
     if matches is None:
         return None
     fit = _Fit(_View.of(before), _View.of(after), matches)

@@ -173,6 +173,12 @@ def test_cameras_that_see_only_far_ground_have_no_motion():
     assert relative_motion(level, level) is None
 
 
+def test_a_camera_on_the_ground_has_no_motion():
+    rgb = picture((0.0, 0.0, 60.0, 0.0, 0.0, 0.0))
+    assert relative_motion(believed(rgb), believed(rgb)).up_m == pytest.approx(0.0, abs=1e-6)
+    assert relative_motion(believed(rgb), believed(rgb, height_m=0.0)) is None
+
+
 def test_larger_pictures_are_matched_when_made_smaller():
     stands = [(0.0, 0.0, 60.0, 0.0, 0.0, 0.0), (3.0, 12.0, 60.0, 8.0, 0.0, 0.0)]
     large = []

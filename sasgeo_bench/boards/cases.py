@@ -196,6 +196,15 @@ def count_cases(cases: pd.DataFrame) -> dict[str, int]:
     return {name: int(counts.get(name, 0)) for name in FAILURES}
 
 
+def count_turned(scores: pd.DataFrame) -> int:
+    """Return the number of right fixes whose heading is off by more than success allows; no failure holds them.
+
+    >>> count_turned(pd.DataFrame({"is_right": [True, True, False], "yaw_error_deg": [4.0, 6.0, 90.0]}))
+    1
+    """
+    return int((scores["is_right"].astype(bool) & (scores["yaw_error_deg"] > SUCCESS_DEG)).sum())
+
+
 class Words(TypedDict):
     """What rejectors state of one answer, by rejector: chance to be false, or an order, and whether it is accepted."""
 

@@ -335,8 +335,12 @@ def flown(region, middle, laid, tmp_path):
     return lay
 
 
-def test_visual_odometry_is_what_the_pictures_show(flown):
-    tasks, lines = quiet(flown(np.zeros((6, 2)), odometry="visual"))
+def test_visual_odometry_is_what_the_pictures_show(flown, program):
+    request = flown(np.zeros((6, 2)))
+    words = ("--region", str(request.region), "--poses", str(request.poses), "--out", str(request.out))
+    code, out, err = program("import-photos", str(request.pictures), *words, "--odometry", "visual")
+    assert code == 0, err
+    tasks = [Task.open(Path(line)) for line in out.splitlines()]
     steps = [query.step for query in sorted(tasks[1].queries(), key=lambda query: query.step.frame)]
     assert [step.increment is None for step in steps] == [True, False, False, True, True, False]
     for step in steps:
@@ -346,7 +350,7 @@ def test_visual_odometry_is_what_the_pictures_show(flown):
             assert 0.1 * 15.0 < spread_m < 0.3 * 15.0  # heights above take-off are known to 10 %
     assert "visual: matches of ORB features" in tasks[1].manifest.what
     assert "odometer" not in tasks[0].manifest.what
-    (line,) = [line for line in lines if line.startswith("visual odometry")]
+    (line,) = [line for line in err.splitlines() if line.startswith("visual odometry")]
     assert line.startswith("visual odometry: 2 of 5 pairs of pictures lost (40%); off the files' positions by 0.")
 
 

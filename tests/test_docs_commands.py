@@ -68,7 +68,7 @@ ONLY_PARSED = {
     r"^sasgeo-bench locate ": "needs pictures of the reader's own; tests/observing/test_locate.py draws some",
     r"^sasgeo-bench import-photos |tasks/photos": "needs photos; tests/observing/test_import_photos.py makes some",
     r"^sasgeo-bench import-masks |tasks/masks": "needs masks; tests/observing/test_import_masks.py makes some",
-    r"^sasgeo-bench (import|locate)-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
+    r"^sasgeo-bench import-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
     r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",
 }
 # Commands of other programs that are not run, each with its reason.

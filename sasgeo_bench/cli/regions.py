@@ -161,7 +161,9 @@ PHOTOS: Final = (".jpg", ".jpeg", ".tif", ".tiff", ".dng")
 class NewRegionOptions(Options):
     """Flags of new-region."""
 
-    name: Annotated[str, typer.Argument(help="id of the region, such as my-town")] = field(kw_only=False)
+    name: Annotated[str | None, typer.Argument(help="id of the region, such as my-town")] = field(
+        default=None, kw_only=False
+    )
     center: Annotated[str | None, typer.Option(help="LON,LAT of its middle, degrees; with --size")] = None
     size: Annotated[str | None, typer.Option(help="of its sides, such as 2km, 800m or 2x3km (width x height)")] = None
     bounds: Annotated[str | None, typer.Option(help="W,S,E,N, degrees; instead of --center")] = None
@@ -213,6 +215,8 @@ def new_region(options: NewRegionOptions) -> Path:
     """  # noqa: E501 - an error is one line
     from sasgeo_bench.regions import new_region as one_region  # noqa: PLC0415 - build-region needs none
 
+    if options.name is None:
+        raise ConfigError("name the region, such as my-town: it becomes its id, and the name of its file")
     folders = options.extracts or []
     path = one_region.new_region(
         options.name,
@@ -270,15 +274,32 @@ def _taken_at(folder: Path) -> NDArray[np.float64]:
     return np.array(lonlat, dtype=np.float64).reshape(-1, 2)
 
 
-def new_region_command(options: NewRegionOptions) -> None:
-    """Write the region file of a place: INTO/NAME.toml, from the newest extract at hand that covers it."""
+def new_region_command(
+    options: NewRegionOptions,
+    *,
+    manifest: Annotated[
+        Path | None, typer.Option(help="list of extracts (*.toml): a file for each of one to three windows of each")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="with --manifest, places read at once")] = 1,
+) -> None:
+    """Write the region file of a place: INTO/NAME.toml, from the newest extract at hand that covers it; or of many."""
+    given = vars(options) | {"say": say}
     with shown_progress():
-        new_region(**vars(options) | {"say": say})
+        if manifest is None:
+            new_region(**given)
+            return
+        shared = {name: given.pop(name) for name in ("into", "extracts", "say", "tell", "progress")}
+        other = [name for name, value in vars(NewRegionOptions()).items() if name in given and given[name] != value]
+        if other:
+            raise ConfigError(
+                f"--manifest states the places itself: leave {other[0].replace('_', '-')} out, or leave out --manifest"
+            )
+        propose_regions(manifest, jobs=jobs, **shared)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProposeOptions(Options):
-    """Flags of propose-regions."""
+    """Keywords of propose_regions, as flags of new-region --manifest."""
 
     manifest: Annotated[Path, typer.Argument(help="list of extracts (*.toml): file, place, country, what, date")] = (
         field(kw_only=False)
@@ -348,12 +369,6 @@ def _holds(path: Path, text: str) -> bool:
         return plain_file(path).read_text(encoding="utf-8") == text
     except (OSError, UnicodeDecodeError):
         return False
-
-
-def propose_regions_command(options: ProposeOptions) -> None:
-    """Write region files for the extracts of a manifest: one to three windows for each place, where it is built."""
-    with shown_progress():
-        propose_regions(**vars(options) | {"say": say})
 
 
 @dataclass(frozen=True, kw_only=True)

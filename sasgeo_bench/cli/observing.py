@@ -34,9 +34,10 @@ class LocateOptions(Options):
     pictures: Annotated[Path, typer.Argument(help="a picture, or a folder of them (JPEG, PNG, WebP, GeoTIFF)")] = field(
         kw_only=False
     )
-    region: Annotated[str | None, typer.Option(help="built region, or its folder; default: the newest that fits")] = (
-        None
-    )
+    region: Annotated[
+        str | None,
+        typer.Option(help="built region, its folder, or a packed map (*.map); default: the newest that fits"),
+    ] = None
     near: Annotated[str | None, typer.Option(help="LON,LAT of the middle of the search; default: the file's")] = None
     radius: Annotated[float, typer.Option(help="of the search, metres")] = RADIUS_M
     heading: Annotated[

@@ -38,6 +38,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "build-region": "regions",
         "render-imagery": "regions",
         "measure-ageing": "ageing",
+        "pack-map": "regions",
     },
     "Your own pictures": {
         "locate": "observing",

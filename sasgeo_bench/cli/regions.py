@@ -13,13 +13,15 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from sasgeo_bench.cli.built_regions import built_region
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, counted, named
-from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.folders import absolute, fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.regions import build
+from sasgeo_bench.regions.packed_map import SUFFIX, UNPACKED, pack_map
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_spec import (
     OWN_FOLDER,
@@ -369,6 +371,22 @@ def _holds(path: Path, text: str) -> bool:
         return plain_file(path).read_text(encoding="utf-8") == text
     except (OSError, UnicodeDecodeError):
         return False
+
+
+def pack_map_command(
+    region: Annotated[str, typer.Argument(help="built region, or its folder")],
+    *,
+    with_imagery: Annotated[
+        bool, typer.Option("--with-imagery", help="pack the aerial imagery, too: it is far larger than the map")
+    ] = False,
+    into: Annotated[Path | None, typer.Option(help="file to write, *.map; default: OUT/maps/REGION.map")] = None,
+    out: Out = Path("out"),
+) -> None:
+    """Write what matching reads of a built region into one file, for a computer that builds no regions."""
+    folder = built_region(region, out)
+    path = into or out / UNPACKED / f"{absolute(folder).name}{SUFFIX}"
+    about = pack_map(folder, path, with_imagery=with_imagery)
+    say(f"{path}: {about.to_text()}")
 
 
 @dataclass(frozen=True, kw_only=True)

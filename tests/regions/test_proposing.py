@@ -338,3 +338,15 @@ def test_regions_are_named_or_every_one_is_built(mistake):
     line = "name regions to build, or build --every region, not both"
     assert line in mistake("build-region")
     assert line in mistake("build-region", "monaco", "--every")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--manifest", "no.toml", "--center", "9.5,47.1"), "leave center out, or leave out --manifest"),
+        (("my-town", "--manifest", "no.toml"), "leave name out, or leave out --manifest"),
+        (("--center", "9.5,47.1", "--size", "2km"), "name the region, such as my-town"),
+    ],
+)
+def test_a_place_is_named_or_a_manifest_is(mistake, words, expected):
+    assert expected in mistake("new-region", *words)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A task whose map is a packed one is answered as on the built region, which need not be there."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.parquet import read_frame
+from sasgeo_bench.regions.packed_map import UNPACKED, pack_map, unpack_map
+from sasgeo_bench.running.plan import RunRequest, plan_run, reach_of
+from sasgeo_bench.running.prediction_files import RunManifest, parts_of
+from sasgeo_bench.running.profiling import ProfileRequest, profile
+from tests import world
+
+TOWN = "town-riverside"
+TIMED = ("latency_s", "matcher_s")  # which no two runs have in common
+
+
+@pytest.fixture(scope="module")
+def packed(tasks: Path, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("packed") / f"{TOWN}.map"
+    pack_map(tasks / "regions" / TOWN, path)
+    return path
+
+
+@pytest.fixture
+def aboard(tasks, packed, tmp_path) -> tuple[Path, Path]:
+    """The root of an aircraft, with a task and a packed map, and no region; the task."""
+    out = tmp_path / "aboard"
+    task = out / "tasks" / "clean" / TOWN
+    shutil.copytree(tasks / "tasks" / "clean" / TOWN, task)
+    shutil.copy(packed, out)
+    return out, task
+
+
+def rows(runs: Path) -> bytes:
+    """All rows of a run in the order of their queries, without times."""
+    frame = pd.concat([read_frame(path, mend="") for path in parts_of(runs)])
+    return frame.drop(columns=[*TIMED]).sort_values("query_id").to_json(orient="records", double_precision=15).encode()
+
+
+@pytest.mark.parametrize("matcher", ["sasgeo", "random"])
+def test_the_answers_are_the_same_bytes(tasks, aboard, matcher, tmp_path):
+    out, task = aboard
+    here = Path(shutil.copytree(tasks, tmp_path / "here"))
+    built = world.answered(here, matcher, [here / "tasks" / "clean" / TOWN], limit=3)
+    with pytest.raises(StoreError, match=r"holds no region\.json"):
+        plan_run(RunRequest(spec=matcher, tasks=[task], out=out))
+    one = unpack_map(out / f"{TOWN}.map", out)
+    flown = world.answered(out, matcher, [task], limit=3, maps=[one])
+    assert rows(flown) == rows(built)
+    before, after = (RunManifest.open(next(runs.rglob("run.json")).parent) for runs in (built, flown))
+    assert (after.hash, after.map_fingerprint) == (before.hash, before.map_fingerprint)
+    assert after.map_bytes == sum(record.bytes for record in one.about.files.values())
+
+
+def test_a_map_of_no_task_is_refused(tasks, aboard, tmp_path):
+    out, task = aboard
+    pack_map(tasks / "regions" / "town-grid", tmp_path / "grid.map")
+    maps = [unpack_map(path, out) for path in (out / f"{TOWN}.map", tmp_path / "grid.map")]
+    with pytest.raises(ConfigError, match=r"grid\.map is not the map of 1 task .*pack the build of town-grid"):
+        plan_run(RunRequest(spec="random", tasks=[task], out=out, maps=maps))
+
+
+def test_who_looks_at_imagery_is_not_asked_on_a_map_packed_without(aboard):
+    out, task = aboard
+    one = unpack_map(out / f"{TOWN}.map", out)
+    without = replace(one, about=one.about.model_copy(update={"left_out": ("ortho.tif",)}))
+    with pytest.raises(ConfigError, match=r"was packed without imagery, .*: pack-map --with-imagery"):
+        plan_run(RunRequest(spec="orb_homography", tasks=[task], out=out, maps=[without]))
+    assert plan_run(RunRequest(spec="random", tasks=[task], out=out, maps=[without])).parts[0].left
+
+
+def test_other_maps_that_lie_unpacked_are_hidden(tasks, aboard, tmp_path):
+    out, task = aboard
+    pack_map(tasks / "regions" / "town-grid", tmp_path / "grid.map")
+    mine, other = (unpack_map(path, out).folder for path in (out / f"{TOWN}.map", tmp_path / "grid.map"))
+    reach = reach_of(RunRequest(spec="random", tasks=[task], out=out), [mine])
+    assert reach.readable == [mine.resolve()]
+    assert other.resolve() in reach.hidden
+    assert not any(mine.resolve().is_relative_to(path.resolve()) for path in reach.hidden)
+    assert UNPACKED in other.parts
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_it_is_profiled_by_its_own_size(aboard):
+    out, task = aboard
+    one = unpack_map(out / f"{TOWN}.map", out)
+    found = profile(ProfileRequest(spec="random", tasks=(task,), out=out, sustain_s=0.01, maps=[one]))
+    assert found.region == TOWN
+    assert found.map_bytes == sum(record.bytes for record in one.about.files.values())
+
+
+def test_the_program_takes_it(program, aboard):
+    out, task = aboard
+    words = ("--matcher", "random", "--tasks", task, "--maps", out / f"{TOWN}.map", "--out", out)
+    code, printed, err = program("run", *words, "--limit", "2")
+    assert code == 0, err
+    assert parts_of(Path(printed.strip()))
+    code, printed, err = program("profile", *words, "--seconds", "0.1")
+    assert code == 0, err
+    assert "map on disk: 0." in printed

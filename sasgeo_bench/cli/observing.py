@@ -21,6 +21,7 @@ from sasgeo_bench.observing.fixes import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTE
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results
+from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
 _PAIR: Final = re.compile(r"\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*,\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*")
@@ -87,6 +88,10 @@ def locate(options: LocateOptions) -> Located:
         ...
     sasgeo_bench.core.errors.ImageError: there is no picture or folder garden.jpg: check the path
     """
+    if options.region is not None and is_packed_map(Path(options.region)):
+        weights = unpack_map(options.region, options.out).about.weights
+        if weights is not None:
+            tell(f"what {weights.matcher} has learned is left packed: P(false fix) is calibrated without it")
     into = options.into or options.out / "locate" / _name_of(options.pictures)
     heading = None if options.heading in (None, "any") else _heading(options.heading or "")
     request = LocateRequest(

@@ -21,7 +21,7 @@ from sasgeo_bench.core.folders import absolute, fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.regions import build
-from sasgeo_bench.regions.packed_map import SUFFIX, UNPACKED, pack_map
+from sasgeo_bench.regions.packed_map import SUFFIX, UNPACKED, Weights, pack_map
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_spec import (
     OWN_FOLDER,
@@ -379,14 +379,35 @@ def pack_map_command(
     with_imagery: Annotated[
         bool, typer.Option("--with-imagery", help="pack the aerial imagery, too: it is far larger than the map")
     ] = False,
+    learned: Annotated[
+        Path | None,
+        typer.Option(help="folder of a run, OUT/runs/MATCHER/HASH/SUITE/REGION: pack what it has learned, too"),
+    ] = None,
     into: Annotated[Path | None, typer.Option(help="file to write, *.map; default: OUT/maps/REGION.map")] = None,
     out: Out = Path("out"),
 ) -> None:
     """Write what matching reads of a built region into one file, for a computer that builds no regions."""
     folder = built_region(region, out)
     path = into or out / UNPACKED / f"{absolute(folder).name}{SUFFIX}"
-    about = pack_map(folder, path, with_imagery=with_imagery)
+    weights = None if learned is None else _learned_by(learned)
+    about = pack_map(folder, path, with_imagery=with_imagery, learned=weights)
     say(f"{path}: {about.to_text()}")
+
+
+def _learned_by(run: Path) -> tuple[Weights, Path]:
+    """Return who learned what in a run, and the file of that text."""
+    from sasgeo_bench.matching.cards import read_learned  # noqa: PLC0415 - build-region needs none
+    from sasgeo_bench.running.prediction_files import RunManifest  # noqa: PLC0415 - as above
+
+    about = RunManifest.open(run)
+    training = None if about is None else about.learned
+    if about is None or training is None or training.file is None:
+        what = "holds no run" if about is None else "is a run without training"
+        raise ConfigError(f"{run} {what}: name one that was made with --train, as OUT/runs/MATCHER/HASH/SUITE/REGION")
+    path = absolute(run).parent.parent / training.file
+    if read_learned(path) is None:
+        raise ConfigError(f"{path} is missing, which {run} says was learned: run again with the same --train")
+    return Weights(matcher=about.matcher.name, trained_on=tuple(training.trained_on), pairs=training.pairs), path
 
 
 @dataclass(frozen=True, kw_only=True)

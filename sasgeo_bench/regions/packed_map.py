@@ -2,16 +2,16 @@
 """A built region in one file: what matching reads of it, for the computer of an aircraft.
 
 A packed map is a tar archive without compression, for its files are compressed: `map.json`, and beside it layers,
-features and graph as they were built. It is unpacked once, into a folder named after its hash, and is a region there:
-whatever takes the folder of a region gives the same answers on it.
+features and graph as they were built, and what a matcher has learned, if that is packed too. It is unpacked once, into
+a folder named after its hash, and is a region there: whatever takes the folder of a region gives the same answers.
 """
 
 import hashlib
 import io
 import tarfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from re import fullmatch
@@ -28,7 +28,7 @@ from sasgeo_bench.core.json import parse_json
 from sasgeo_bench.core.paths import given_path, plain_file
 from sasgeo_bench.core.texts import FOLDER, json_text, one_line
 from sasgeo_bench.regions.imagery import ORTHO
-from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
+from sasgeo_bench.regions.region import ATTRIBUTION, Count, Manifest
 from sasgeo_bench.regions.region_files import (
     EDGES,
     FEATURES,
@@ -39,15 +39,24 @@ from sasgeo_bench.regions.region_files import (
     read_manifest,
 )
 
+LEARNED: Final = "learned.json"  # as of a run
 SUFFIX: Final = ".map"
 UNPACKED: Final = "maps"  # below the root of what is built
 MAP_VERSION: Final = 1
 _ABOUT: Final = "map.json"
 _MOST_ABOUT: Final = 1_000_000  # bytes
 _NEEDED: Final = (MANIFEST, LAYERS, FEATURES, NODES, EDGES)
-_KNOWN: Final = (_ABOUT, *_NEEDED, ORTHO)
+_KNOWN: Final[tuple[str, ...]] = (_ABOUT, *_NEEDED, ORTHO, LEARNED)
 _MEND: Final = "fetch the file again, or pack the map again with pack-map"
 _DAMAGES: Final = (tarfile.TarError, EOFError, ValueError, OverflowError, RecursionError)
+
+
+class Weights(JsonDocument):
+    """Who learned the text that is packed with a map, of which places, and of how many queries with their truths."""
+
+    matcher: str
+    trained_on: tuple[str, ...]
+    pairs: Count
 
 
 class PackedMap(JsonDocument):
@@ -69,6 +78,7 @@ class PackedMap(JsonDocument):
     files: dict[str, FileRecord]
     left_out: tuple[str, ...] = ()
     publish: bool = True
+    weights: Weights | None = None
 
     @classmethod
     def read(cls, content: object, path: Path) -> Self:
@@ -84,7 +94,8 @@ class PackedMap(JsonDocument):
         except ConfigError as error:
             raise StoreError(f"{path} is damaged ({str(error)[:200]}): {_MEND}") from error
         lost = [name for name in _NEEDED if name not in about.files]
-        if lost or not set(about.files) <= set(_KNOWN) - {_ABOUT}:
+        odd = set(about.files) - set(_KNOWN) or {_ABOUT} & set(about.files)
+        if lost or odd or (about.weights is None) != (LEARNED not in about.files):
             raise StoreError(f"{path} is damaged ({_ABOUT} does not list what a map is of): {_MEND}")
         return about
 
@@ -92,16 +103,31 @@ class PackedMap(JsonDocument):
         """Describe in one line how large it is, and what was left out."""
         without = f"; without {', '.join(self.left_out)}" if self.left_out else ""
         kept = "" if self.publish else "; it must not be passed on (publish = false)"
-        return f"{self.mb:.2f} MB, {self.mb_per_km2:.2f} MB a km2 of {self.km2:.2f} km2{without}{kept}"
+        learned = "" if self.weights is None else f"; with what {self.weights.matcher} has learned"
+        return f"{self.mb:.2f} MB, {self.mb_per_km2:.2f} MB a km2 of {self.km2:.2f} km2{learned}{without}{kept}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UnpackedMap:
-    """A packed map, and the folder that it lies unpacked in, which is that of a region."""
+    """A packed map, and the folder that it lies unpacked in, `root`: a region, and what a matcher has learned."""
 
     file: Path
     about: PackedMap
-    folder: Path
+    root: Path
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the region."""
+        return self.root / self.about.region
+
+    @property
+    def learned(self) -> Path:
+        """File of the text that `about.weights` tells of."""
+        return self.root / LEARNED
+
+    def path(self, name: str) -> Path:
+        """Return where one of `about.files` lies."""
+        return self.learned if name == LEARNED else self.folder / name
 
     @property
     def lacks_imagery(self) -> bool:
@@ -118,7 +144,9 @@ def is_packed_map(path: Path) -> bool:
     return path.suffix == SUFFIX and not path.is_dir()
 
 
-def pack_map(folder: Path, path: Path, *, with_imagery: bool = False) -> PackedMap:
+def pack_map(
+    folder: Path, path: Path, *, with_imagery: bool = False, learned: tuple[Weights, Path] | None = None
+) -> PackedMap:
     """Write what matching reads of a built region into one file; the same region gives the same bytes.
 
     Parameters
@@ -129,6 +157,8 @@ def pack_map(folder: Path, path: Path, *, with_imagery: bool = False) -> PackedM
         File to write, `*.map`; an earlier packed map there is replaced.
     with_imagery : bool
         Whether the aerial imagery goes in, which is far larger than the map, and which few matchers look at.
+    learned : tuple of Weights and Path, optional
+        What a matcher has learned, and the file of that text.
 
     Raises
     ------
@@ -149,25 +179,28 @@ def pack_map(folder: Path, path: Path, *, with_imagery: bool = False) -> PackedM
     manifest = read_manifest(folder)
     if with_imagery and manifest.imagery is None:
         raise ConfigError(f"{folder} has no imagery: leave --with-imagery out")
-    packed = [name for name in _KNOWN if name in manifest.files and (with_imagery or name != ORTHO)]
-    check_files(folder, packed)
+    sources = {name: folder / name for name in _KNOWN if name in manifest.files and (with_imagery or name != ORTHO)}
+    check_files(folder, sources)
     if path.exists():
         _read_about(path)  # refuses what is no packed map, so that nothing else is replaced
     with fresh_file(path, mend="check the free space and your rights, or name another file with --into") as scratch:
-        return _write(folder, manifest, packed, scratch)
+        return _write(absolute(folder).name, manifest, sources, learned, scratch)
 
 
-def _write(folder: Path, manifest: Manifest, names: Sequence[str], path: Path) -> PackedMap:
-    """Write a packed map of some files of a region, and its manifest without the others."""
-    own = absolute(folder).name
+def _write(
+    own: str, manifest: Manifest, sources: dict[str, Path], learned: tuple[Weights, Path] | None, path: Path
+) -> PackedMap:
+    """Write a packed map of some files of a region, which has its manifest without the others."""
     kept = manifest.model_copy(
         update={
-            "files": {name: manifest.files[name] for name in names},
-            "imagery": manifest.imagery if ORTHO in names else None,
+            "files": {name: manifest.files[name] for name in sources},
+            "imagery": manifest.imagery if ORTHO in sources else None,
         }
     )
     text = json_text(kept.model_dump(mode="json")).encode()
     files = {MANIFEST: FileRecord(sha256=hashlib.sha256(text).hexdigest(), bytes=len(text)), **kept.files}
+    if learned is not None:
+        files[LEARNED] = file_record(learned[1])
     km2 = manifest.rows * manifest.cols * manifest.cell_size_m**2 / 1e6
     mb = sum(record.bytes for record in files.values()) / 1e6
     about = PackedMap(
@@ -180,16 +213,17 @@ def _write(folder: Path, manifest: Manifest, names: Sequence[str], path: Path) -
         licence=manifest.licence,
         attribution=_credit(kept),
         files=files,
-        left_out=tuple(sorted(set(manifest.files) - set(names))),
+        left_out=tuple(sorted(set(manifest.files) - set(sources))),
         publish=all(one.publish for one in kept.own_maps) and (kept.imagery is None or kept.imagery.is_publishable),
+        weights=None if learned is None else learned[0],
     )
     head = json_text(about.model_dump(mode="json")).encode()
     with tarfile.open(path, "w:", format=tarfile.USTAR_FORMAT) as archive:
         for name, data in ((_ABOUT, head), (MANIFEST, text)):
             archive.addfile(_member(name, len(data)), io.BytesIO(data))
-        for name in names:
-            with plain_file(folder / name).open("rb") as source:
-                archive.addfile(_member(name, kept.files[name].bytes), source)
+        for name, file in (*sources.items(), *([] if learned is None else [(LEARNED, learned[1])])):
+            with plain_file(file).open("rb") as source:
+                archive.addfile(_member(name, files[name].bytes), source)
     return about
 
 
@@ -210,7 +244,7 @@ def _credit(manifest: Manifest) -> str:
 def unpack_map(path: str | Path, out: Path) -> UnpackedMap:
     """Unpack a packed map below a root, once; a later call finds it there, and holds it against its hashes.
 
-    It lies in `out/maps/<hash of the file>/<name of the region>`, whole or not at all.
+    The region lies in `out/maps/<hash of the file>/<name of the region>`, whole or not at all.
 
     Raises
     ------
@@ -226,20 +260,20 @@ def unpack_map(path: str | Path, out: Path) -> UnpackedMap:
     """
     file = given_path(path)
     about = _read_about(file)
-    folder = out / UNPACKED / sha256_of(file)[:16] / about.region
-    found = UnpackedMap(file=file, about=about, folder=folder)
+    root = out / UNPACKED / sha256_of(file)[:16]
+    found = UnpackedMap(file=file, about=about, root=root)
     if _is_whole(found):  # before the lock: a read-only folder serves as well
         return found
     try:
-        with locked(folder):
+        with locked(root):
             if not _is_whole(found):
-                with fresh_folder(folder) as scratch:
-                    _unpack(found, scratch)
+                with fresh_folder(root) as scratch:
+                    _unpack(replace(found, root=scratch))
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except OSError as error:
         raise StoreError(
-            f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights, or name "
+            f"{root} cannot be written ({error.strerror or error}): check the free space and your rights, or name "
             "another folder by --out"
         ) from error
     return found
@@ -248,7 +282,7 @@ def unpack_map(path: str | Path, out: Path) -> UnpackedMap:
 def _is_whole(found: UnpackedMap) -> bool:
     """Return whether a map lies there as it was packed."""
     try:
-        return all(file_record(found.folder / name) == record for name, record in found.about.files.items())
+        return all(file_record(found.path(name)) == record for name, record in found.about.files.items())
     except OSError:
         return False
 
@@ -289,8 +323,9 @@ def _read_about(path: Path) -> PackedMap:
         raise StoreError(f"{path} cannot be read ({error.strerror or error}): check the path") from error
 
 
-def _unpack(found: UnpackedMap, folder: Path) -> None:
-    """Unpack a map into an empty folder; refuse files that are not what `map.json` says."""
+def _unpack(found: UnpackedMap) -> None:
+    """Unpack a map into its folder, which is empty; refuse files that are not what `map.json` says."""
+    found.folder.mkdir()
     with _opened(found.file) as (about, members, archive):
         if about != found.about:
             raise StoreError(f"{found.file} was replaced while it was read: run again")
@@ -298,10 +333,10 @@ def _unpack(found: UnpackedMap, folder: Path) -> None:
             content = archive.extractfile(member)
             if content is None or name not in about.files or member.size != about.files[name].bytes:
                 raise StoreError(f"{found.file} is damaged ({name} is not what {_ABOUT} says): {_MEND}")
-            with (folder / name).open("wb") as target:
+            with found.path(name).open("wb") as target:
                 copyfileobj(content, target)
     for name, record in found.about.files.items():
-        path = folder / name
+        path = found.path(name)
         if not path.is_file() or file_record(path) != record:
             raise StoreError(f"{found.file} is damaged ({name} is not what {_ABOUT} says): {_MEND}")
-    read_manifest(folder)
+    read_manifest(found.folder)

@@ -142,11 +142,30 @@ class RunPart:
     key: str | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PackedTraining:
+    """What a matcher learned elsewhere, packed with a map, in place of a training set; `count` are its pairs."""
+
+    text: str
+    places: tuple[str, ...]
+    count: int
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def to_text(self) -> str:
+        """As that of a training set."""
+        return f"{counted(self.count, 'query', 'queries')} of {named(self.places, 'place')}, packed with the map"
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
     """Plan of a run, made after the plugin's card was read in its own process.
 
-    `training_result` is the reply to training, without a text where it failed, and None before.
+    `training_result` is the reply to training, without a text where it failed, and None before. Where the matcher has
+    learned elsewhere, `training_set` is what was packed with a map.
     """
 
     request: RunRequest
@@ -154,7 +173,7 @@ class RunPlan:
     hash: str
     parts: tuple[RunPart, ...]
     learns: bool = False
-    training_set: TrainingSet | None = None
+    training_set: TrainingSet | PackedTraining | None = None
     training_result: Reply | None = None
 
     @property
@@ -226,7 +245,7 @@ def plan_run(request: RunRequest) -> RunPlan:
     _check(request)
     if request.dask is not None:  # other processes work in other folders
         asked, train = ([task.resolve() for task in folders] for folders in (request.tasks, request.train))
-        maps = [replace(one, folder=one.folder.resolve()) for one in request.maps]
+        maps = [replace(one, root=one.root.resolve()) for one in request.maps]
         request = replace(request, out=request.out.resolve(), tasks=asked, train=train, maps=maps)
     if ":" not in request.spec:
         list_entry_points()  # warns of a clash of names: what the plugin's own process prints is not shown
@@ -239,8 +258,12 @@ def plan_run(request: RunRequest) -> RunPlan:
         {"top_k": request.top_k, "limits": limits, "is_sandboxed": request.is_sandboxed}, sort_keys=True
     )
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
-    training_set = result = None
-    if learns and request.train:
+    training_set: TrainingSet | PackedTraining | None = None
+    result = None
+    if learns and not request.train:
+        training_set = _packed_training(request.maps, card)
+        result = None if training_set is None else Reply(status="ok", learned=training_set.text)
+    elif learns:
         training_set = plan_training(
             request.train,
             asked=() if request.is_oracle else request.tasks,
@@ -291,7 +314,23 @@ def _run_folder(request: RunRequest, card: MatcherCard, found: str) -> Path:
     return request.out / "runs" / card.name / found
 
 
-def _key(training_set: TrainingSet, result: Reply | None) -> str:
+def _packed_training(maps: Sequence[UnpackedMap], card: MatcherCard) -> PackedTraining | None:
+    """Return what a matcher learned by what is packed with the maps; None where there is nothing for it."""
+    found = None
+    for one in maps:
+        weights = one.about.weights
+        text = None if weights is None or weights.matcher != card.name else read_learned(one.learned)
+        if weights is None or text is None:
+            continue
+        if found is not None and found.text != text:
+            raise ConfigError(
+                f"{one.file} holds other weights of {card.name!r} than the maps before it: run them one by one"
+            )
+        found = PackedTraining(text=text, places=weights.trained_on, count=weights.pairs)
+    return found
+
+
+def _key(training_set: TrainingSet | PackedTraining, result: Reply | None) -> str:
     text = None if result is None else result.learned
     hashed = f"nothing yet from {training_set.sha256}" if text is None else text
     return hashlib.sha256(hashed.encode()).hexdigest()

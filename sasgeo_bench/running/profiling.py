@@ -256,7 +256,7 @@ def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> tupl
                 if radius_m is None or (query.prior.radius_m is not None and query.prior.radius_m <= radius_m)
                 else f"no prior within {radius_m:g} m"
             )
-            reason = far or lacks(plan.card, query, is_taught=bool(request.train), is_pictured=is_pictured)
+            reason = far or lacks(plan.card, query, is_taught=plan.training_set is not None, is_pictured=is_pictured)
             if reason is None and len(found) < MOST_ASKED:
                 found.append(blob)
             reasons[reason or ""] += 1

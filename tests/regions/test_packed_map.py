@@ -178,6 +178,7 @@ def test_a_file_that_was_cut_is_refused(packed, tmp_path, share):
         (lambda it: changed(it, map_version=7), "of version 7, this program reads 1"),
         (lambda it: changed(it, region="../../home"), "damaged .*region"),
         (lambda it: changed(it, files={}), "does not list what a map is of"),
+        (lambda it: changed(it, weights={"matcher": "mine", "trained_on": [], "pairs": 1}), "does not list what"),
         (lambda it: changed(it, nonsense=1), "unknown key 'nonsense'"),
         (lambda it: it | {"map.json": b"[]"}, "of version None"),
         (lambda it: it | {"map.json": b"{"}, "damaged"),

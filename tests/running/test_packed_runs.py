@@ -10,7 +10,8 @@ import pytest
 
 from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.core.parquet import read_frame
-from sasgeo_bench.regions.packed_map import UNPACKED, pack_map, unpack_map
+from sasgeo_bench.regions.packed_map import UNPACKED, Weights, pack_map, unpack_map
+from sasgeo_bench.regions.region_files import differing_files
 from sasgeo_bench.running.plan import RunRequest, plan_run, reach_of
 from sasgeo_bench.running.prediction_files import RunManifest, parts_of
 from sasgeo_bench.running.profiling import ProfileRequest, profile
@@ -84,6 +85,66 @@ def test_other_maps_that_lie_unpacked_are_hidden(tasks, aboard, tmp_path):
     assert other.resolve() in reach.hidden
     assert not any(mine.resolve().is_relative_to(path.resolve()) for path in reach.hidden)
     assert UNPACKED in other.parts
+
+
+def taught(tasks: Path, root: Path) -> Path:
+    """A run that learned in one town, over another; the folder of its answers."""
+    here = Path(shutil.copytree(tasks, root))
+    (train,) = (here / "tasks" / "alias").glob("town-grid*")
+    runs = world.answered(here, "learners:Counts", [here / "tasks" / "clean" / TOWN], limit=2, train=(train,))
+    return next(runs.rglob("run.json")).parent
+
+
+def test_what_was_learned_travels_with_the_map_and_ties_the_same_answers(program, tasks, aboard, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    out, task = aboard
+    run = taught(tasks, tmp_path / "here")
+    path = tmp_path / "taught.map"
+    code, printed, err = program("pack-map", tasks / "regions" / TOWN, "--learned", run, "--into", path)
+    assert code == 0, err
+    assert "; with what counts has learned" in printed
+    one = unpack_map(path, out)
+    assert differing_files(one.folder) == []
+    flown = world.answered(out, "learners:Counts", [task], limit=2, maps=[one])
+    assert rows(flown) == rows(run.parents[3])
+    before, after = RunManifest.open(run), RunManifest.open(next(flown.rglob("run.json")).parent)
+    assert (after.hash, after.key, after.learned.key) == (before.hash, before.key, before.learned.key)
+    assert (after.learned.trained_on, after.learned.pairs) == (["town-grid"], before.learned.pairs)
+    assert (flown / "counts" / after.hash / after.learned.file).read_bytes() == one.learned.read_bytes()
+
+
+def test_another_matcher_leaves_the_weights_alone(tasks, aboard, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    out, task = aboard
+    text = tmp_path / "text.json"
+    text.write_text("{}")
+    by = Weights(matcher="counts", trained_on=("town-grid",), pairs=3)
+    pack_map(tasks / "regions" / TOWN, tmp_path / "a.map", learned=(by, text))
+    one = unpack_map(tmp_path / "a.map", out)
+    assert plan_run(RunRequest(spec="sasgeo", tasks=[task], out=out, maps=[one])).key is None
+    assert plan_run(RunRequest(spec="learners:Counts", tasks=[task], out=out, maps=[one])).key is not None
+
+
+def test_weights_of_two_kinds_are_refused(tasks, aboard, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    out, task = aboard
+    by, text = Weights(matcher="counts", trained_on=("town-grid",), pairs=3), tmp_path / "text.json"
+    maps = []
+    for name in "ab":
+        text.write_text(f'"{name}"')
+        pack_map(tasks / "regions" / TOWN, tmp_path / f"{name}.map", learned=(by, text))
+        maps.append(unpack_map(tmp_path / f"{name}.map", out))
+    with pytest.raises(ConfigError, match=r"b\.map holds other weights of 'counts' than the maps before it"):
+        plan_run(RunRequest(spec="learners:Counts", tasks=[task], out=out, maps=maps))
+
+
+def test_a_run_without_training_has_nothing_to_pack(mistake, tasks, tmp_path):
+    here = Path(shutil.copytree(tasks, tmp_path / "here"))
+    runs = world.answered(here, "random", [here / "tasks" / "clean" / TOWN], limit=1)
+    run = next(runs.rglob("run.json")).parent
+    words = ("pack-map", here / "regions" / TOWN, "--learned")
+    assert "is a run without training: name one that was made with --train" in mistake(*words, run)
+    assert "holds no run: name one" in mistake(*words, tmp_path)
 
 
 @pytest.mark.usefixtures("in_threads")

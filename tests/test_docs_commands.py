@@ -59,6 +59,7 @@ ONLY_PARSED = {
     r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/cli/test_cli_runs.py does it",
     r"^sasgeo-bench read-flight ": "needs a log of the reader's own; tests/cli/test_cli_flights.py reads some",
     r"--train ": "needs a matcher that learns; tests/running does it",
+    r"--maps ": "needs a task on that map; tests/running/test_packed_runs.py asks some",
     r"FILE\.json|<hash>": "needs what a matcher has learnt",
     r"HASH|--query ID": "needs a run or a query of the reader's own; tests/boards/test_board_pictures.py does it",
     r"out/boards/demo": "needs the board of the demo; tests/boards/test_publish.py publishes small ones",

@@ -181,8 +181,10 @@ def pack_map(
         raise ConfigError(f"{folder} has no imagery: leave --with-imagery out")
     sources = {name: folder / name for name in _KNOWN if name in manifest.files and (with_imagery or name != ORTHO)}
     check_files(folder, sources)
-    if path.exists():
-        _read_about(path)  # refuses what is no packed map, so that nothing else is replaced
+    if path.exists() and not _is_sound(path):
+        raise StoreError(
+            f"{path} is there, and is no packed map to replace: remove it, or name another file with --into"
+        )
     with fresh_file(path, mend="check the free space and your rights, or name another file with --into") as scratch:
         return _write(absolute(folder).name, manifest, sources, learned, scratch)
 
@@ -321,6 +323,15 @@ def _read_about(path: Path) -> PackedMap:
         raise
     except OSError as error:
         raise StoreError(f"{path} cannot be read ({error.strerror or error}): check the path") from error
+
+
+def _is_sound(path: Path) -> bool:
+    """Return whether a file says of itself that it is a packed map of this version."""
+    try:
+        _read_about(path)
+    except StoreError:
+        return False
+    return True
 
 
 def _unpack(found: UnpackedMap) -> None:

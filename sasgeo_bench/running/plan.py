@@ -482,8 +482,8 @@ def _check_maps(maps: Sequence[UnpackedMap], tasks: Sequence[Task]) -> None:
     other = next((one for one in maps if not any(_is_of(task, one) for task in tasks)), None)
     if other is not None:
         raise ConfigError(
-            f"{other.file} is not the map of {named([str(task.folder) for task in tasks], 'task')}: pack the build of "
-            f"{other.about.region} that the queries were made on, or leave it out"
+            f"{other.file}, a map of {other.about.region}, is not what the queries of "
+            f"{named([str(task.folder) for task in tasks], 'task')} were made on: pack that build, or leave it out"
         )
 
 

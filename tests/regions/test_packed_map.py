@@ -220,7 +220,7 @@ def test_a_text_a_folder_and_a_pipe_of_that_name_are_refused(tmp_path):
 def test_packing_replaces_nothing_but_a_packed_map(region, tmp_path):
     notes = tmp_path / "notes.map"
     notes.write_text("mine")
-    with pytest.raises(StoreError, match=r"notes\.map is no packed map"):
+    with pytest.raises(StoreError, match=r"notes\.map is there, and is no packed map to replace"):
         pack_map(region, notes)
     assert notes.read_text() == "mine"
     with pytest.raises(ConfigError, match=r"a packed map is named \*\.map, as in .*town\.map"):

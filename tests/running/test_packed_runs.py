@@ -63,7 +63,9 @@ def test_a_map_of_no_task_is_refused(tasks, aboard, tmp_path):
     out, task = aboard
     pack_map(tasks / "regions" / "town-grid", tmp_path / "grid.map")
     maps = [unpack_map(path, out) for path in (out / f"{TOWN}.map", tmp_path / "grid.map")]
-    with pytest.raises(ConfigError, match=r"grid\.map is not the map of 1 task .*pack the build of town-grid"):
+    with pytest.raises(
+        ConfigError, match=r"grid\.map, a map of town-grid, is not what the queries of 1 task .* were made on"
+    ):
         plan_run(RunRequest(spec="random", tasks=[task], out=out, maps=maps))
 
 
@@ -136,6 +138,17 @@ def test_weights_of_two_kinds_are_refused(tasks, aboard, tmp_path, monkeypatch):
         maps.append(unpack_map(tmp_path / f"{name}.map", out))
     with pytest.raises(ConfigError, match=r"b\.map holds other weights of 'counts' than the maps before it"):
         plan_run(RunRequest(spec="learners:Counts", tasks=[task], out=out, maps=maps))
+
+
+def test_locate_says_that_it_leaves_the_weights(program, tasks, tmp_path):
+    text = tmp_path / "text.json"
+    text.write_text("{}")
+    by = Weights(matcher="sasgeo", trained_on=("town-grid",), pairs=3)
+    pack_map(tasks / "regions" / TOWN, tmp_path / "a.map", learned=(by, text))
+    code, _, err = program("locate", "none.jpg", "--region", "a.map")
+    assert code == 2
+    assert "what sasgeo has learned is left packed" in err
+    assert "there is no picture or folder none.jpg" in err
 
 
 def test_a_run_without_training_has_nothing_to_pack(mistake, tasks, tmp_path):

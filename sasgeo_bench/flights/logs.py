@@ -15,6 +15,7 @@ from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
+from sasgeo_bench.flights.log_subtitles import read_srt
 from sasgeo_bench.flights.log_table import read_csv
 from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
@@ -26,15 +27,15 @@ from sasgeo_bench.regions.region import Region
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SUFFIXES: Final = (".gpx", ".kml", ".csv", ".pos", ".tum", ".txt", ".tum.gz", ".txt.gz")
+SUFFIXES: Final = (".gpx", ".kml", ".srt", ".csv", ".pos", ".tum", ".txt", ".tum.gz", ".txt.gz")
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
-_TUM: Final = SUFFIXES[4:]
+_TUM: Final = SUFFIXES[5:]
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
 def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | None = None) -> FlightLog:
-    """Read a log by its suffix (GPX, KML, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
+    """Read a log by its suffix (GPX, KML, SRT, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
 
     `facts` say what a table does not; what they say of a file without it is refused. A line drawn in KML has no times:
     `read_flight` flies it at an even speed. A `height_m` replaces the log's heights.
@@ -62,7 +63,7 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
 def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     suffix = path.suffix.lower()
     is_table = suffix in (".csv", ".pos")
-    reader = {".gpx": read_gpx, ".kml": read_kml}.get(suffix)
+    reader = {".gpx": read_gpx, ".kml": read_kml, ".srt": _of_srt}.get(suffix)
     if reader is None and not is_table:
         mend = "unzip a .kmz, export a .ulg by ulog2csv of pyulog"
         raise FlightError(f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are ({mend})")
@@ -73,6 +74,10 @@ def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
         return read_csv(path, replace(facts, height_unit="none") if has_height else facts)
     facts.check_untold(path)
     return reader(path)
+
+
+def _of_srt(path: Path) -> FlightLog:
+    return read_srt(path).log
 
 
 def _meaningless(path: Path, why: str, option: str) -> FlightError:
@@ -110,8 +115,8 @@ def read_flight(
     Parameters
     ----------
     path : Path
-        GPX, KML, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting, northing and height
-        of the region's CRS.
+        GPX, KML, SRT of a DJI, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting,
+        northing and height of the region's CRS.
     region : Region
         The stretch lies over its mapped ground.
     margin_m : float

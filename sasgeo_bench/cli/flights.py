@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands about flights: what a log holds, its stretch over a region, and the drift of odometry."""
 
+import datetime as dt
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,12 +146,15 @@ def _show(log: FlightLog, speed_mps: float) -> None:
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
     lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
     say(f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}")
+    if log.start_s is not None:
+        say(f"starts at {dt.datetime.fromtimestamp(log.start_s, tz=dt.UTC).isoformat(timespec='milliseconds')}")
     for line in (*gaps_of(log.time_s), *log.notes):
         say(line)
-    for name, unit in (("height_m", "m"), ("yaw_deg", "deg"), ("pitch_deg", "deg"), ("roll_deg", "deg")):
+    for name in ("height_m", "altitude_m", "yaw_deg", "pitch_deg", "roll_deg"):
         values = getattr(log, name)
         if values is not None:
-            say(f"{name.partition('_')[0]} from {values.min():.1f} to {values.max():.1f} {unit}")
+            what, _, unit = name.partition("_")
+            say(f"{what} from {values.min():.1f} to {values.max():.1f} {unit}")
     if log.time_s is None:
         tell(f"no times: a flight has an even speed (--speed-mps, {speed_mps:g} m/s)")
     if log.height_m is None:

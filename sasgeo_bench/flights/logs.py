@@ -203,8 +203,8 @@ def _on_grid(log: FlightLog, path: Path, epsg: int, speed_mps: float) -> Traject
     """Return the points of a log in a projected CRS; without a heading yaw is 0."""
     up_m = log.height_m
     if up_m is None:
-        why = "has no height above the ground, and altitudes above the sea are not read"
-        raise FlightError(f"{path.name} {why}: say one, as in --height-m 100")
+        why = "" if log.altitude_m is None else ", and its altitudes do not count from there"
+        raise FlightError(f"{path.name} has no height above the ground{why}: say one, as in --height-m 100")
     en_m = np.stack(from_lonlat(epsg).transform(log.lon_deg, log.lat_deg), axis=1)
     en_m = np.nan_to_num(en_m, nan=_FAR_M, posinf=_FAR_M, neginf=-_FAR_M)
     time_s = log.time_s

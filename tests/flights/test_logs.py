@@ -104,11 +104,16 @@ def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(written, mod
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [
-        ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>"), "elevations, which are above the sea"),
-        ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"), "altitudes, which are not relative to the ground"),
+        ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>", 3),
+         "altitudes, which are not those of all points"),
+        ("b.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>").replace("480", "-.-", 1),
+         "altitudes, which are not those of all points"),
+        ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"),
+         "altitudes, which are neither relative to the ground nor absolute"),
         ("a.csv", "lat,lon,height_furlong,heading_mil\n1,1,2,3\n1,2,2,3", "'height_furlong', 'heading_mil'"),
-        ("b.csv", "lat,lon,date,altitude_m,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
-         "'date', 'altitude_m'; altitudes above"),
+        ("b.csv", "lat,lon,date,altitude,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
+         "'date', 'altitude'; an altitude is read if one column of them states its unit"),
+        ("e.csv", "lat,lon,altitude_m,time_s,\n1,1,2,1,\n1,1.00001,,3,", "'altitude_m'; an altitude is read if"),
         ("c.csv", "lat,lon,pitch_deg,\x1b[31m\n1,1,2,3\n1,2,2,3", "'pitch_deg', '?[31m'"),
         ("d.csv", "lat,lon," + ",".join(f"c{at:0>99}" for at in range(99)), "'c000"),
     ],
@@ -137,6 +142,17 @@ def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(writt
     )
     log = read_log(written("a.kml", text))
     assert (log.time_s.tolist(), log.height_m.tolist()) == ([0, 1, 2], [60, 60, 60])
+    assert (log.start_s, log.altitude_m) == (START.timestamp(), None)
+    above_sea = read_log(written("b.kml", text.replace("relativeToGround", "absolute").replace("Z</when>", "</when>")))
+    assert (above_sea.altitude_m.tolist(), above_sea.altitude_of) == ([60, 60, 60], "geoid")
+    assert (above_sea.height_m, above_sea.start_s) == (None, None)  # a time without a zone
+
+
+def test_a_gpx_track_starts_in_utc_and_does_not_say_which_sea_its_elevations_count_from(written: Callable) -> None:
+    log = read_log(written("a.gpx", _gpx(_points()).replace("<time>", "<ele>480.5</ele><time>")))
+    assert (log.start_s, log.altitude_m.tolist(), log.altitude_of) == (START.timestamp(), [480.5] * 5, "unknown")
+    bare = read_log(written("b.gpx", _gpx(_points(), times=False)))
+    assert (bare.start_s, bare.altitude_m, bare.height_m) == (None, None, None)
 
 
 @pytest.mark.parametrize(
@@ -364,7 +380,7 @@ def test_heights_come_from_the_log_or_are_given(written: Callable, region: Regio
     assert np.unique(read_flight(with_heights, region).position_m[:, 2]).tolist() == [70]
     assert np.unique(read_flight(with_heights, region, height_m=90.0).position_m[:, 2]).tolist() == [90]
     without = written("b.csv", _table(region, _across(region), more=",alt", cells=",470"))
-    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground, .*: say one, as in --height-m 100"):
+    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground: say one, as in --height-m 100"):
         read_flight(without, region)
 
 

@@ -13,7 +13,14 @@ import numpy as np
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import message_of
-from sasgeo_bench.flights.log_points import MOST_BYTES, FlightLog, Floats, LogSource, tell_left_out
+from sasgeo_bench.flights.log_points import (
+    MOST_BYTES,
+    FlightLog,
+    Floats,
+    LogSource,
+    altitude_note,
+    tell_left_out,
+)
 
 _NUMBER: Final = r"[+-]?\d+(?:\.\d+)?"
 # The end of a block is not used, so that one at 00:00:60,000 is as good as any.
@@ -25,7 +32,7 @@ _ABOVE_HOME: Final = re.compile(rf"\bH\s+({_NUMBER})\s*m\b(?!/s)")
 _CLOCK: Final = re.compile(
     r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})[ T]+(\d{1,2}):(\d{2}):(\d{2})((?:[,.:]\d{1,6}){0,2})(?!\d)"
 )
-_OF_LOG: Final = ("time_s", "lon_deg", "lat_deg", "height_m")
+_OF_LOG: Final = ("time_s", "lon_deg", "lat_deg", "height_m", "altitude_m")
 _LEAST_STEP_S: Final = 0.2  # between points: positions jump by a receiver's step, at a hundred blocks in a second
 _RADIANS: Final = (np.pi, np.pi / 2)  # largest longitude and latitude
 # Column -> by what keys it is known, the best first.
@@ -44,13 +51,11 @@ class Subtitles:
     Parameters
     ----------
     log : FlightLog
-        Places, heights above take-off, and the attitude of the body. Times count from the begin of the video.
+        Places, heights above take-off, altitudes, and the attitude of the body. Times count from the video's begin.
     gimbal_deg : ndarray, shape (N, 3), optional
         Yaw from true north, pitch (-90 is straight down) and roll of the camera, degrees.
     film_mm : ndarray, shape (N,), optional
         Focal length on 35 mm film, the digital zoom included.
-    altitude_m : ndarray, shape (N,), optional
-        Altitude, metres; DJI does not say whether above the sea or the ellipsoid.
     began : datetime, optional
         By the drone's clock when the video began; its zone is not said.
     """
@@ -58,7 +63,6 @@ class Subtitles:
     log: FlightLog
     gimbal_deg: Floats | None = None
     film_mm: Floats | None = None
-    altitude_m: Floats | None = None
     began: dt.datetime | None = None
 
 
@@ -256,7 +260,7 @@ class _Columns:
         if "height_m" in columns:
             notes.append("height: above the place of take-off")
         if "altitude_m" in columns:
-            notes.append("altitude: above the sea or the ellipsoid, which DJI does not say")
+            notes.append(altitude_note("unknown"))
         if "gimbal_deg" in columns:
             notes.append("angles of the camera: yaw, pitch and roll of the gimbal")
         if self.began is not None:
@@ -266,7 +270,6 @@ class _Columns:
             log=FlightLog.of(self.source, self.numbers, of_log, notes=tuple(notes)),
             gimbal_deg=columns.get("gimbal_deg"),
             film_mm=None if film_mm is None else film_mm * columns.get("zoom", np.ones(len(film_mm))),
-            altitude_m=columns.get("altitude_m"),
             began=self.began,
         )
 

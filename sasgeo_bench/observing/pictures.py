@@ -181,7 +181,9 @@ def list_pictures(path: Path, *, is_told: bool = True) -> list[Path]:
         other = Counter(one.suffix.lower() for one in files if one.suffix.lower() in _UNREAD)
         if other and is_told:
             kinds = ", ".join(f"{count} {suffix}" for suffix, count in other.most_common())
-            tell(f"passed over in {path}: {kinds}, which are not read: export them as JPEG, frames of a video too")
+            tell(
+                f"passed over in {path}: {kinds}, which are not read here: export them as JPEG, and name a video by itself"
+            )
         if not found:
             raise ImageError(f"{path} holds no picture ({', '.join(SUFFIXES)}): name a folder that does")
         return found

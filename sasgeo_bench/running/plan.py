@@ -70,7 +70,7 @@ _BYTES_PER_MB = 10**6
 # Folders below a root that reveal truths, answers, or what pictures of later queries show.
 _HIDDEN: Final = (
     *("tasks", "truth", "runs", "boards", "release", "results", "sheets", "sealed"),
-    *("segmenters", "private", "datasets", "head-start"),
+    *("segmenters", "private", "datasets", "head-start", "frames"),
 )
 _LEAST_MB, _MOST_MB = 64, 4_000_000
 

@@ -167,7 +167,8 @@ def _own(seen: MotionSeen) -> tuple[Floats, Floats]:
     if not seen.time_s:
         return np.empty(0), np.empty(0)
     at = np.arange(0, seen.time_s[-1], STEP_S)
-    window = np.ones(round(_WINDOW_S / STEP_S))
+    window = np.ones(round(_WINDOW_S / STEP_S) + 1)  # of an odd length, so that it moves nothing
+    window[[0, -1]] = 0.5
     found = []
     for values in (np.array(seen.speed), np.array(seen.turn_degps)):
         is_known = np.isfinite(values)
@@ -177,7 +178,7 @@ def _own(seen: MotionSeen) -> tuple[Floats, Floats]:
         times = np.array(seen.time_s)
         even = np.interp(at, times[is_known], values[is_known])
         nearest = np.abs(times[is_known][:, None] - at).min(axis=0)
-        smooth = np.convolve(even, window / len(window), mode="same")
+        smooth = np.convolve(even, window / window.sum(), mode="same")
         found.append(np.where(nearest <= _WINDOW_S, smooth, np.nan))
     return found[0], found[1]
 

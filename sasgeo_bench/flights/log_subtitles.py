@@ -296,6 +296,6 @@ def _changes(columns: Mapping[str, Floats]) -> list[int]:
     for at in range(1, len(time_s)):
         gained_s = time_s[at] - time_s[kept[-1]]
         is_last = at == len(time_s) - 1
-        if gained_s < 0 or (gained_s >= _LEAST_STEP_S and (is_last or (said[at] != said[kept[-1]]).any())):
+        if gained_s < 0 or (gained_s > _LEAST_STEP_S - 1e-6 and (is_last or (said[at] != said[kept[-1]]).any())):
             kept.append(at)  # where time goes back, which the log refuses
     return kept

@@ -2,12 +2,13 @@
 """When a video began by a log's clock: frames of a textured plane that is moved by plain arrays."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.log_points import FlightLog
@@ -51,10 +52,17 @@ def log_of(path: Flown, seconds: float, *, yaw: bool = True, noise_m: float = 0.
 
 
 def seen_of(path: Flown, begin_s: float, seconds: float) -> MotionSeen:
-    """What is seen of a plane from above, frame by frame, from a time of the flight on."""
+    """The motion that is seen of a plane from above, from a time of the flight on."""
+    seen = MotionSeen()
+    for at, rgb in enumerate(seen_frames(path, begin_s, seconds)):
+        seen.add(at * STEP_S, rgb)
+    return seen
+
+
+def seen_frames(path: Flown, begin_s: float, seconds: float) -> Iterator[NDArray[np.uint8]]:
+    """The frames of a plane from above, one every `STEP_S`."""
     rng = np.random.default_rng(3)
     texture = cv2.resize(rng.integers(0, 256, (150, 150), dtype=np.uint8), (900, 900), interpolation=cv2.INTER_CUBIC)
-    seen = MotionSeen()
     metres = GROUND_M / SIZE[0]
     for time_s in np.arange(0.0, seconds, STEP_S).tolist():
         east, north, heading = path(begin_s + time_s)
@@ -66,8 +74,7 @@ def seen_of(path: Flown, begin_s: float, seconds: float) -> MotionSeen:
         y = north - right * math.sin(turn) + ahead * math.cos(turn)
         at = np.stack([x / metres, -y / metres]).astype(np.float32)
         grey = cv2.remap(texture, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-        seen.add(time_s, np.repeat(grey[..., None], 3, axis=2))
-    return seen
+        yield np.repeat(grey[..., None], 3, axis=2)
 
 
 @pytest.fixture(scope="module")

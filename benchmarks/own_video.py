@@ -69,7 +69,10 @@ def lens() -> Intrinsics:
 def flown(region: sgb.Region, seconds: float, reach_m: float, rng: np.random.Generator) -> list[Stood]:
     """Return a flight that stays on the mosaic: speeds of 4 to 14 m/s, and turns towards drawn places."""
     west, south, east, north = region.imagery.record.bounds_m
-    low, high = np.array([west, south]) + reach_m, np.array([east, north]) - reach_m
+    # Over the inner half of the mosaic, which is the town that it was taken of.
+    margin = np.maximum(reach_m, np.array([east - west, north - south]) / 4)
+    low, high = np.array([west, south]) + margin, np.array([east, north]) - margin
+
     place, goal, yaw, speed = rng.uniform(low, high), rng.uniform(low, high), rng.uniform(0, 360), 8.0
     found = []
     for at in range(round(seconds * RATE)):
@@ -77,7 +80,7 @@ def flown(region: sgb.Region, seconds: float, reach_m: float, rng: np.random.Gen
             goal = rng.uniform(low, high)
         wish = math.degrees(math.atan2(*(goal - place)))
         yaw += float(np.clip((wish - yaw + 180) % 360 - 180, -25.0, 25.0)) / RATE
-        speed = float(np.clip(speed + rng.normal(0, 1.5) / RATE**0.5, 4.0, 14.0))
+        speed = float(np.clip(speed + 0.2 * (9.0 - speed) / RATE + 2.0 * rng.normal() / RATE**0.5, 4.0, 14.0))
         place = np.clip(
             place + speed / RATE * np.array([math.sin(math.radians(yaw)), math.cos(math.radians(yaw))]), low, high
         )
@@ -155,7 +158,7 @@ def main() -> None:
     parser.add_argument("--into", type=Path, required=True, help="folder of the video and of what is said of it")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--every", type=float, default=4.0, help="seconds between frames that are located")
-    parser.add_argument("--height", type=float, default=230.0, help="of the camera above the ground, metres")
+    parser.add_argument("--height", type=float, default=180.0, help="of the camera above the ground, metres")
     parser.add_argument("--tilt", type=float, default=0.0, help="of the camera, degrees from straight down")
     parser.add_argument("--late", type=float, default=20.0, help="seconds of the GPX before the video begins")
     parser.add_argument("--segmenter", default="osm_unet_held_out")
@@ -164,7 +167,7 @@ def main() -> None:
     region = sgb.read_region(given.out / "regions" / given.region)
     given.into.mkdir(parents=True, exist_ok=True)
     path = given.into / f"{given.region}.mp4"
-    reach_m = given.height * (1.1 + math.tan(math.radians(given.tilt)))
+    reach_m = given.height * (1.0 + math.tan(math.radians(given.tilt)))
     flight = flown(region, given.seconds + given.late, reach_m, np.random.default_rng(given.seed))
     stood = write(region, path, flight, given)
     seen = MotionSeen()

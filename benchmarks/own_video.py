@@ -26,7 +26,7 @@ from benchmarks.own_photos import FILM_MM, photo_of
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.flights.logs import read_log
 from sasgeo_bench.geometry.projection import to_grid, to_lonlat
-from sasgeo_bench.observing.video_clock import STEP_S, MotionSeen, find_begin
+from sasgeo_bench.observing.video_motion import STEP_S, MotionSeen, find_begin
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.video import Video
 

@@ -8,7 +8,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -30,7 +30,7 @@ from sasgeo_bench.flights.log_units import LOWEST_M
 from sasgeo_bench.flights.logs import MOST_GAP_S, is_tum, read_log
 from sasgeo_bench.observing.pictures import STEEPEST_DEG
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M
-from sasgeo_bench.observing.video_clock import NEAR_S, STEP_S, Begin, MotionSeen, find_begin
+from sasgeo_bench.observing.video_motion import NEAR_S, STEP_S, Begin, Headings, MotionSeen, find_begin, find_headings
 from sasgeo_bench.sensing.camera import Attitude
 from sasgeo_bench.sensing.photos import Lens
 from sasgeo_bench.sensing.video import SUFFIXES, Due, Video
@@ -285,8 +285,7 @@ def _read_track(path: Path) -> _Track:
         # The gimbal follows the body's yaw, unless it is turned by hand.
         angles = np.column_stack([log.yaw_deg, np.full(len(log), -90.0), np.zeros(len(log))])
         notes.append("no angles of the camera: taken as looking straight down, its up as the drone heads")
-    elif angles is None:
-        notes.append("no angles of the camera: taken as looking straight down, of any heading")
+
     return _Track(
         path=path,
         log=log,
@@ -306,14 +305,16 @@ class _Cutter:
     request: VideoRequest
     video: Video
     track: _Track | None
+    headings: Headings | None = None
     lines: list[str] = field(default_factory=list)
     left_out: "Counter[str]" = field(default_factory=Counter)
 
     def cut(self, folder: Path) -> list[str]:
         """Write the photos into a folder; return lines for the user, the last of which sums up."""
-        seen = MotionSeen() if self._has_to_find_begin else None
+        seen = MotionSeen() if self._needs_motion else None
         times_s = list(self._decoded(folder, seen))
         begin = self._begin(seen)
+        self._find_headings(seen, begin)
         photos = 0
         for time_s in times_s:
             photos += self._finished(folder / self._name(time_s), time_s, begin)
@@ -329,8 +330,12 @@ class _Cutter:
         return [*self.lines, f"{counted(photos, 'frame')} of {name}, one every {self.request.every_s:g} s, as photos"]
 
     @property
-    def _has_to_find_begin(self) -> bool:
-        return self.track is not None and self.track.has_own_clock and self.request.offset_s is None
+    def _needs_motion(self) -> bool:
+        """Return whether the motion that the video shows says what the track does not."""
+        track = self.track
+        if track is None:
+            return False
+        return track.camera_deg is None or (track.has_own_clock and self.request.offset_s is None)
 
     def _name(self, time_s: float) -> str:
         return f"{self.video.path.stem}_{time_s:09.3f}s.jpg"
@@ -374,6 +379,8 @@ class _Cutter:
             return found
         if found.height_m is not None and found.height_m < LOWEST_M:
             return f"less than {LOWEST_M:g} m above take-off"
+        if found.camera is None and self.headings is not None:
+            return replace(found, camera=Attitude(yaw_deg=self.headings.at(time_s), pitch_deg=-90.0))
         if found.camera is not None:
             tilt_deg = math.degrees(math.acos(np.clip(found.camera.matrix[2, 0], -1.0, 1.0)))
             if tilt_deg > STEEPEST_DEG:
@@ -386,7 +393,7 @@ class _Cutter:
         if track is None or not track.has_own_clock:
             return Begin(time_s=0.0)
         name = plain(track.path.name)
-        if seen is None:
+        if seen is None or self.request.offset_s is not None:
             begin = Begin(time_s=self.request.offset_s or 0.0)
             self.lines.append(f"{name}: the video begins at {begin.time_s:g} s of it, as --offset says")
             return begin
@@ -404,6 +411,16 @@ class _Cutter:
                 line += f"; clocks disagree: by them it is {stated_s:.1f} s (many cameras write local time as if UTC)"
         self.lines.append(line)
         return begin
+
+    def _find_headings(self, seen: MotionSeen | None, begin: Begin) -> None:
+        track = self.track
+        if seen is None or track is None or track.camera_deg is not None:
+            return
+        self.headings = find_headings(seen, track.log, begin.time_s)
+        heads = "of any heading"
+        if self.headings is not None:
+            heads = f"its up by the track's course and the motion seen (+-{self.headings.sigma_deg:.0f} deg)"
+        self.lines.append(f"{plain(track.path.name)}: no angles of the camera: taken as looking straight down, {heads}")
 
     def _finished(self, path: Path, time_s: float, begin: Begin) -> bool:
         """Write into a photo what is known of it, or remove it; return whether it stays."""

@@ -22,7 +22,7 @@ from sasgeo_bench.observing.posed_pictures import Heights, pose_pictures
 from sasgeo_bench.observing.video import VideoRequest, is_video, video_photos
 from sasgeo_bench.sensing.photos import read_head, read_photo
 from tests.flights.test_log_subtitles import block
-from tests.observing.test_video_clock import STEP_S, log_of, seen_frames, straight, winding
+from tests.observing.test_video_motion import STEP_S, log_of, seen_frames, straight, winding
 from tests.videos import box, changed, made_at, number_of, numbered, write_video
 
 LON, LAT = 9.52, 47.14
@@ -176,7 +176,6 @@ def test_places_of_four_decimals_are_worth_less(made: Made) -> None:
     head = read_head(list_pictures(folder)[0])
     assert float(head.gps[31]) == pytest.approx(sigma_m, abs=0.01)  # GPSHPositioningError
     assert any("no angles of the camera: taken as looking straight down" in line for line in lines)
-    assert read_photo(list_pictures(folder)[0]).gimbal is None
 
 
 def test_the_bodys_heading_stands_in_for_a_camera_that_looks_down(made: Made) -> None:
@@ -244,6 +243,9 @@ def test_a_track_by_its_own_clock_is_joined_by_the_motion_seen(filmed: Path, tmp
     assert any(re.search(hint, line) for line in lines), lines
     for at, photo in enumerate(map(read_photo, list_pictures(folder))):
         assert photo.lat_deg == pytest.approx(np.interp(33.3 + 10 * at, log.time_s, log.lat_deg), abs=3e-5)
+        assert photo.gimbal is not None
+        off_deg = (photo.gimbal.yaw_deg - winding(33.3 + 10 * at)[2] + 180) % 360 - 180
+        assert (off_deg, photo.gimbal.pitch_deg) == (pytest.approx(0.0, abs=6.0), -90.0)
         assert photo.taken_at is not None
         off_s = photo.taken_at.replace(tzinfo=dt.UTC) - start
         assert off_s.total_seconds() == pytest.approx(33.3 + 10 * at, abs=0.5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a video began by the clock of a flight log: by the motion that its frames show."""
+"""The motion that a video shows, held against a flight log: when it began by the log's clock, and which way is up."""
 
 import math
 from dataclasses import dataclass, field
@@ -30,6 +30,9 @@ _FLAT: Final = 1e-9
 _LOWEST_M: Final = 2.0
 _MOVES_MPS: Final = 1.0  # below it a course is noise
 _SIGMA_S: Final = 0.05  # at the least
+_CARRIED_S: Final = 10.0  # for which turns that are seen carry a heading: they drift by a degree or two
+_MOST_SIGMA_DEG: Final = 20.0  # of a heading that is worth saying
+_DEGREE_M: Final = 111_195.0
 
 
 @dataclass
@@ -37,11 +40,12 @@ class MotionSeen:
     """Measures how fast, and how it turned, a camera moved between frames that follow each other.
 
     Speeds are in widths of the picture per second: of a camera above level ground they are proportional to its own, as
-    long as its height stays. Turns are clockwise, degrees per second.
+    long as its height stays. Bearings of the way are clockwise from the picture's up, turns clockwise per second.
     """
 
     time_s: list[float] = field(default_factory=list)
     speed: list[float] = field(default_factory=list)
+    bearing_deg: list[float] = field(default_factory=list)
     turn_degps: list[float] = field(default_factory=list)
     _last: tuple[float, NDArray[np.uint8]] | None = None
 
@@ -51,29 +55,33 @@ class MotionSeen:
         grey = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
         if self._last is not None and time_s > self._last[0]:
             gained_s = time_s - self._last[0]
-            moved, turned_deg = _moved(self._last[1], np.asarray(grey, dtype=np.uint8))
+            moved, bearing_deg, turned_deg = _moved(self._last[1], np.asarray(grey, dtype=np.uint8))
             self.time_s.append(time_s - gained_s / 2)
             self.speed.append(moved / gained_s)
+            self.bearing_deg.append(bearing_deg)
             self.turn_degps.append(turned_deg / gained_s)
         self._last = (time_s, np.asarray(grey, dtype=np.uint8))
 
 
-def _moved(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> tuple[float, float]:
-    """Return how far the middle moved, in widths, and by how many degrees the camera turned clockwise."""
+def _moved(before: NDArray[np.uint8], after: NDArray[np.uint8]) -> tuple[float, float, float]:
+    """Return how far the camera moved, in widths; where to, from up clockwise; and how it turned clockwise, degrees."""
     points = cv2.goodFeaturesToTrack(before, maxCorners=_POINTS, qualityLevel=0.01, minDistance=8)
     if points is None or len(points) < _LEAST_POINTS:
-        return math.nan, math.nan
+        return math.nan, math.nan, math.nan
     there, is_found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, winSize=(21, 21), maxLevel=4)  # type: ignore[call-overload]
     followed = is_found.ravel() == 1
     if followed.sum() < _LEAST_POINTS:
-        return math.nan, math.nan
+        return math.nan, math.nan, math.nan
     matrix, is_in = cv2.estimateAffinePartial2D(points[followed], there[followed], ransacReprojThreshold=2.0)
     if matrix is None or is_in.sum() < max(_LEAST_POINTS, followed.sum() / 3):
-        return math.nan, math.nan
+        return math.nan, math.nan, math.nan
     middle = np.array([before.shape[1] / 2, before.shape[0] / 2])
     shift = matrix[:, :2] @ middle + matrix[:, 2] - middle
-    # What is seen turns against the camera; rows count downwards, so that a positive angle is clockwise.
-    return float(np.hypot(*shift)) / before.shape[1], -math.degrees(math.atan2(matrix[1, 0], matrix[0, 0]))
+    # What is seen moves and turns against the camera; rows count downwards, so that a positive angle is clockwise.
+    turned_deg = -math.degrees(math.atan2(matrix[1, 0], matrix[0, 0]))
+    # From halfway between both: the first picture's up turns on.
+    bearing_deg = math.degrees(math.atan2(-shift[0], shift[1])) - turned_deg / 2
+    return float(np.hypot(*shift)) / before.shape[1], bearing_deg, turned_deg
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,6 +128,65 @@ def find_begin(seen: MotionSeen, log: FlightLog, name: str, *, stated_s: float |
     )
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Headings:
+    """Which way a picture's up pointed, degrees from true north, at times of a video; and its standard deviation."""
+
+    time_s: Floats
+    heading_deg: Floats
+    sigma_deg: float
+
+    def at(self, time_s: float) -> float:
+        """Return the heading at a time of the video, degrees in [0, 360)."""
+        return float(np.interp(time_s, self.time_s, self.heading_deg)) % 360.0
+
+
+def find_headings(seen: MotionSeen, log: FlightLog, begin_s: float) -> Headings | None:
+    """Return headings by the course that a log has, and the direction in which the picture moved; None if unknown.
+
+    Turns that are seen carry a heading over seconds in which the drone hovers. A camera that looks ahead moves in its
+    picture as one that looks down.
+    """
+    assert log.time_s is not None  # noqa: S101 - by the caller
+    if not seen.time_s:
+        return None
+    times = np.array(seen.time_s)
+    at = times + begin_s
+    ends = [_metres(log, at + side * _WINDOW_S / 2) for side in (-1, 1)]
+    way = ends[1] - ends[0]
+    speed_mps = np.hypot(*way.T) / _WINDOW_S
+    course_deg = np.degrees(np.arctan2(way[:, 0], way[:, 1]))
+    turned_deg = np.concatenate([[0.0], np.cumsum(np.nan_to_num(seen.turn_degps)[:-1] * np.diff(times))])
+    offset = np.exp(1j * np.radians(course_deg - np.array(seen.bearing_deg) - turned_deg))
+    is_in = (at >= log.time_s[0]) & (at <= log.time_s[-1])
+    is_known = np.isfinite(offset) & is_in & (speed_mps >= _MOVES_MPS)
+    if is_known.sum() * STEP_S < _LEAST_S / 2:
+        return None
+    known_s, offset, power = times[is_known], offset[is_known], speed_mps[is_known] ** 2
+    mean = np.empty(len(times), dtype=complex)
+    sigmas_deg = np.empty(len(times))
+    for row, time_s in enumerate(times):
+        away_s = np.abs(known_s - time_s)
+        weight = power * np.exp((away_s.min() - away_s) / _CARRIED_S)
+        weight /= weight.sum()
+        mean[row] = (weight * offset).sum()
+        spread = math.sqrt(-2 * math.log(min(max(abs(mean[row]), 1e-6), 1 - 1e-9)))
+        count = max(1.0, STEP_S / _INDEPENDENT_S / float((weight**2).sum()))
+        sigmas_deg[row] = math.degrees(spread / math.sqrt(count))
+    sigma_deg = float(np.median(sigmas_deg))
+    if not sigma_deg <= _MOST_SIGMA_DEG:
+        return None
+    heading_deg = np.degrees(np.unwrap(np.angle(mean))) + turned_deg
+    return Headings(time_s=times, heading_deg=heading_deg, sigma_deg=round(max(1.0, sigma_deg), 1))
+
+
+def _metres(log: FlightLog, time_s: Floats) -> Floats:
+    """Return places of a log, shape (N, 2), metres to the east and north, but for a factor."""
+    lat = np.interp(time_s, log.time_s, log.lat_deg)  # type: ignore[arg-type]
+    lon = np.interp(time_s, log.time_s, np.unwrap(log.lon_deg, period=360))  # type: ignore[arg-type]
+    return np.column_stack([lon * np.cos(np.radians(log.lat_deg.mean())), lat]) * _DEGREE_M
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Track:
     """Speed and turn rate of a log, every `_FINE_S` from its first point; nan where they are not known."""
@@ -136,10 +203,7 @@ class _Track:
     def of(cls, log: FlightLog) -> "_Track":
         assert log.time_s is not None  # noqa: S101 - by the caller
         time_s = np.arange(log.time_s[0], log.time_s[-1], _FINE_S)
-        lat = np.interp(time_s, log.time_s, log.lat_deg)
-        lon = np.interp(time_s, log.time_s, np.unwrap(log.lon_deg, period=360))
-        metres = np.column_stack([lon * np.cos(np.radians(lat.mean())), lat]) * 111_195.0  # of a degree: to a factor
-        way = _over_window(metres) / _WINDOW_S
+        way = _over_window(_metres(log, time_s)) / _WINDOW_S
         speed_mps = np.hypot(*way.T)
         if log.yaw_deg is not None:
             yaw_deg = np.interp(time_s, log.time_s, np.unwrap(log.yaw_deg, period=360))
@@ -177,7 +241,8 @@ def _own(seen: MotionSeen) -> tuple[Floats, Floats]:
             continue
         times = np.array(seen.time_s)
         even = np.interp(at, times[is_known], values[is_known])
-        nearest = np.abs(times[is_known][:, None] - at).min(axis=0)
+        after = np.searchsorted(times[is_known], at).clip(1, is_known.sum() - 1)
+        nearest = np.minimum(*(np.abs(times[is_known][side] - at) for side in (after - 1, after)))
         smooth = np.convolve(even, window / window.sum(), mode="same")
         found.append(np.where(nearest <= _WINDOW_S, smooth, np.nan))
     return found[0], found[1]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.flights.log_points import FlightLog
-from sasgeo_bench.observing.video_clock import STEP_S, MotionSeen, find_begin
+from sasgeo_bench.observing.video_motion import STEP_S, MotionSeen, find_begin, find_headings
 
 LON, LAT = 9.52, 47.14
 HEIGHT_M = 80.0
@@ -121,6 +121,33 @@ def replace_start(log: FlightLog, from_s: float) -> FlightLog:
         lat_deg=log.lat_deg[kept],
         yaw_deg=log.yaw_deg[kept],
     )
+
+
+def test_headings_are_the_course_less_the_way_that_is_seen(wound: MotionSeen) -> None:
+    """The picture's up swings by some hundred degrees about a course that stays, in which no log says a heading."""
+    found = find_headings(wound, log_of(winding, 300.0, yaw=False), 33.3)
+    assert found is not None
+    assert found.sigma_deg < 5.0
+    for time_s in (3.0, 10.0, 20.0, 30.0, 38.0):
+        off_deg = (found.at(time_s) - winding(33.3 + time_s)[2] + 180) % 360 - 180
+        assert off_deg == pytest.approx(0.0, abs=max(3 * found.sigma_deg, 6.0))
+
+
+def test_turns_carry_a_heading_over_a_hover() -> None:
+    def flown(time_s: float) -> tuple[float, float, float]:
+        """To the east for 10 s, then a turn by 90 degrees on the spot."""
+        return 7.0 * min(time_s, 10.0), 0.0, 90.0 + 9.0 * min(max(time_s - 12.0, 0.0), 10.0)
+
+    found = find_headings(seen_of(flown, 0.0, 26.0), log_of(flown, 40.0, yaw=False, noise_m=0.1), 0.0)
+    assert found is not None
+    assert found.at(5.0) == pytest.approx(90.0, abs=4.0)
+    assert found.at(25.0) == pytest.approx(180.0, abs=5.0)
+
+
+def test_where_nothing_moves_no_heading_is_known() -> None:
+    log = log_of(lambda _: (0.0, 0.0, 0.0), 60.0)
+    assert find_headings(seen_of(lambda _: (0.0, 0.0, 0.0), 0.0, 20.0), log, 0.0) is None
+    assert find_headings(MotionSeen(), log, 0.0) is None
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,10 @@ from typing import Annotated, Final, Literal
 
 import typer
 
+from sasgeo_bench.cli.built_regions import built_region
 from sasgeo_bench.cli.console import said_after
 from sasgeo_bench.cli.observing import VideoOptions
 from sasgeo_bench.cli.options import Options, Out, takes
-from sasgeo_bench.cli.targets import built_region
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.observing.import_masks import SUITE as MASKS
 from sasgeo_bench.observing.import_masks import MaskRequest

@@ -11,9 +11,9 @@ from typing import Annotated, Final
 
 import typer
 
+from sasgeo_bench.cli.built_regions import built_region
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, said_after, say
 from sasgeo_bench.cli.options import Options, Out, takes
-from sasgeo_bench.cli.targets import built_region
 from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain

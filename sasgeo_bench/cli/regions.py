@@ -21,7 +21,13 @@ from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region import Manifest
-from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
+from sasgeo_bench.regions.region_spec import (
+    OWN_FOLDER,
+    RegionFile,
+    find_region_file,
+    list_region_files,
+    read_region_file,
+)
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 
@@ -170,7 +176,7 @@ class NewRegionOptions(Options):
         bool, typer.Option("--keep-cut", help="cut the place out of its extract, and write the cut beside the file")
     ] = False
     extracts: ExtractFolders = None
-    into: Annotated[Path, typer.Option(help="folder to write the region file into")] = Path("my-regions")
+    into: Annotated[Path, typer.Option(help="folder to write the region file into")] = OWN_FOLDER
     most_mb: Annotated[
         float, typer.Option(min=0, help="largest regional extract to download where none is at hand, MB; 0: none")
     ] = 500.0
@@ -277,7 +283,7 @@ class ProposeOptions(Options):
     manifest: Annotated[Path, typer.Argument(help="list of extracts (*.toml): file, place, country, what, date")] = (
         field(kw_only=False)
     )
-    into: Annotated[Path, typer.Option(help="folder to write region files into")] = Path("my-regions")
+    into: Annotated[Path, typer.Option(help="folder to write region files into")] = OWN_FOLDER
     extracts: ExtractFolders = None
     jobs: Annotated[int, typer.Option(min=1, help="places read at once")] = 1
 

@@ -9,9 +9,10 @@ import typer
 
 from sasgeo_bench.boards.archive import laid_tasks
 from sasgeo_bench.boards.run_cases import is_run
+from sasgeo_bench.cli.built_regions import find_built
 from sasgeo_bench.cli.console import EXIT_USER, complain, say, shown_progress
 from sasgeo_bench.cli.options import Out, RegionFolders
-from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
+from sasgeo_bench.cli.targets import find_task, is_split, no_target
 from sasgeo_bench.core.errors import ConfigError, counted, named
 from sasgeo_bench.core.progress import spread, tell
 from sasgeo_bench.exchange.submissions import hold_submission

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flights out of files: GPX, KML, tables with latitude and longitude, TUM; brought onto a region and cut to it."""
 
+import hashlib
+import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +15,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
@@ -186,6 +190,32 @@ def read_flight(
     return _longest_inside(flown, is_known, path, region, margin_m, least_m)
 
 
+@dataclass(frozen=True, kw_only=True)
+class FlownPath:
+    """The log of a flight that was flown, and what it does not say; `read_flight` says what each means."""
+
+    file: Path
+    facts: LogFacts = field(default_factory=LogFacts)
+    height_m: float | None = None
+    least_m: float = 200.0  # five views or so
+
+    def __post_init__(self) -> None:
+        if not self.file.is_file():
+            raise FlightError(f"there is no flight log {self.file}: check the path")
+
+    @cached_property
+    def key(self) -> str:
+        """Return the hash of all that the path follows from."""
+        asked = [sha256_of(self.file), self.file.name, asdict(self.facts), self.height_m, self.least_m]
+        return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
+
+    def over(self, region: Region, *, margin_m: float) -> Trajectory:
+        """Return the longest stretch over a region, as `read_flight` does."""
+        return read_flight(
+            self.file, region, margin_m=margin_m, least_m=self.least_m, height_m=self.height_m, facts=self.facts
+        )
+
+
 def _check_near(log: FlightLog, path: Path, region: Region) -> None:
     """Raise `FlightError` if a log lies all beside a region, on one side of it: far off a CRS tells no metres."""
     west, south, east, north = region.manifest.bounds_lonlat
@@ -275,7 +305,7 @@ def _longest_inside(
     if best < 0 or longest_m < least_m:
         message = (
             f"{path.name} leaves {region.manifest.id}: of {along_m[-1]:.0f} m the longest stretch over mapped ground, "
-            f"{margin_m:g} m from its edge and in the air, has {longest_m:.0f} m, {least_m:g} m are needed: take "
+            f"{margin_m:.0f} m from its edge and in the air, has {longest_m:.0f} m, {least_m:g} m are needed: take "
             "another region, or a smaller --margin-m or --least-m"
         )
         raise FlightError(plain(message))

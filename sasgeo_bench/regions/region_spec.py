@@ -29,6 +29,7 @@ from sasgeo_bench.osm.vector import ClassTable
 from sasgeo_bench.regions.imagery import ImageryEntry
 from sasgeo_bench.regions.region import LICENCE, Provenance
 
+OWN_FOLDER: Final = Path("my-regions")  # where new-region writes
 MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
 MAX_LONGITUDE_DEG: Final = 180.0
 MAX_AREA_KM2: Final = 100_000.0
@@ -471,7 +472,9 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
         ...
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
     """
-    return find_document(id_or_path, "region", "list regions shows all", lambda: list_region_files(folders=folders))
+    own = OWN_FOLDER / f"{id_or_path}.toml"
+    mend = f"name the file {own}" if own.is_file() else "list regions shows all"
+    return find_document(id_or_path, "region", mend, lambda: list_region_files(folders=folders))
 
 
 def region_text(

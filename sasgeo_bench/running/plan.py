@@ -342,7 +342,8 @@ def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
     # A release next to other output is hidden too, unless its own map is the one in question.
     hidden = [path for path in hidden if not any(region.is_relative_to(path) for region in readable)]
     # Other dates of a place, and the map that a twin was edited from, would reveal the changes.
-    maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
+    # By where they lie: `regions` may be a link to a larger disk.
+    maps = sorted({path.resolve() for root in roots for path in (root / "regions").glob("*") if path.is_dir()})
     hidden += [*(path for path in maps if path not in readable), *request.hidden]
     return Reach(readable=readable, hidden=hidden, is_sandboxed=request.is_sandboxed)
 

@@ -95,6 +95,8 @@ def test_evidence_is_drawn_in_the_colours_of_its_classes_with_its_confidence_bes
     assert texts == {"building", "water", "none of these classes", "unknown"}
     certain = sgb.Evidence(classes=("water",), cells=np.zeros((1, 4, 4), dtype=np.uint8), cell_size_m=1.0)
     assert len(sgb.plot_evidence(certain).axes) == 1
+    again = seen.plot(title="seen", data="a drone")
+    assert [text.get_text() for text in again.texts] == [text.get_text() for text in figure.texts]
     with pytest.raises(ConfigError, match="expected a Evidence"):
         sgb.plot_evidence(chance)
 

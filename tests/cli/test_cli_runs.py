@@ -309,6 +309,7 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
         ),
         (("--most-trained", "0"), "--most-trained must lie between 1 and 2000, got 0"),
         (("--tasks", "nowhere"), "nowhere holds no task.json: make the queries first"),
+        (("--tasks", str(Path(TASK).parent)), f"holds no task.json: name a task in it, as {TASK}, or all by a *"),
         (("--out", "a-file"), "cannot be written (Not a directory)"),
     ],
 )

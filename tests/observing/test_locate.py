@@ -253,8 +253,11 @@ def test_stored_answers_order_right_before_false():
     false = answers.is_false
     assert p_false[false].mean() > 0.7
     assert p_false[~false].mean() < 0.3
+    # the fit that is stored is that of these answers
+    again = Chances.fitted(answers)
+    np.testing.assert_allclose(again.rejector.p_false(answers.predictions()), p_false, rtol=1e-6, atol=1e-9)
     # a place that is left out changes the fit
-    without = Chances.of(answers, without=[answers.places[0]])
+    without = Chances.fitted(answers, without=[answers.places[0]])
     assert without.p_false(answers.predictions()[0]) != chances.p_false(answers.predictions()[0])
     assert answers_for("sasgeo", "0", "osm_unet") is None
     assert answers_for("sasgeo", answers.version, "colour_thresholds") is None

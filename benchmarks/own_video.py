@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a video over the picture of a region, and say how often `locate` is right about its frames.
 
-    .venv/bin/python benchmarks/own_video.py out chateaugiron-ortho --into video
+    .venv/bin/python -m benchmarks.own_video out chateaugiron-ortho --into video
 
 Needs a region that is built with imagery. The camera looks straight down (`--tilt`: ahead by so much) at 16 : 9 and
 flies legs with turns at a changing speed; its MP4, 5 frames a second, is what a pinhole sees of the mosaic. Beside it

@@ -37,7 +37,7 @@ AxesFlag = Annotated[
 class FlightOptions(Options):
     """Flags of `read-flight`."""
 
-    file: Annotated[Path, typer.Argument(help="GPX, KML, CSV, RTKLIB .pos, or TUM in the region's CRS (.tum, .txt)")]
+    file: Annotated[Path, typer.Argument(help="GPX, KML, SRT, CSV, .pos of RTKLIB, TUM in a region's CRS (.tum, .txt)")]
     region: Annotated[Path | None, typer.Option(help="folder of a built region: cut the flight to it")] = None
     tum: Annotated[Path | None, typer.Option(help="TUM file to write the stretch over the region into")] = None
     height_m: Annotated[float | None, typer.Option(help="height above the ground to keep, instead of the log's")] = None
@@ -144,7 +144,10 @@ def _summary(flown: Trajectory) -> str:
 def _show(log: FlightLog, speed_mps: float) -> None:
     """Print what was read of a log."""
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
-    lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
+    lasts = "no times"
+    if log.time_s is not None:
+        lasts_s = float(log.time_s[-1] - log.time_s[0])  # an SRT counts from the video's begin
+        lasts = f"{lasts_s:.1f} s, {way_m / lasts_s:.2f} m/s on average"
     say(f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}")
     if log.start_s is not None:
         say(f"starts at {dt.datetime.fromtimestamp(log.start_s, tz=dt.UTC).isoformat(timespec='milliseconds')}")

@@ -15,13 +15,16 @@ from benchmarks.own_photos import is_right, take
 from benchmarks.own_video import RATE, Stood, flown, write
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.core.progress import reporting
+from sasgeo_bench.flights.logs import read_log
 from sasgeo_bench.observing.fixes import Fix, LocateRequest
 from sasgeo_bench.observing.locate import locate
 from sasgeo_bench.observing.pictures import list_pictures, open_picture, see
 from sasgeo_bench.observing.video import VideoRequest, video_photos
+from sasgeo_bench.observing.video_motion import STEP_S, MotionSeen, find_begin
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sensing.photos import read_photo
+from sasgeo_bench.sensing.video import Video
 from tests.sensing.test_photos import brighton_beach
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
@@ -69,6 +72,11 @@ def test_frames_of_a_video_are_found_and_become_tasks(real_extracts: Path, tmp_p
     assert len(off_m) == 6
     assert sum(value <= 10.0 for value in off_m) >= 4
     assert [fix.file for fix, value in zip(found.fixes, off_m, strict=True) if fix.is_accepted and value > 25.0] == []
+    # Subtitles count from the video's begin, which the motion seen confirms.
+    seen = MotionSeen()
+    for frame in Video.open(video).frames(STEP_S):
+        seen.add(frame.time_s, frame.rgb)
+    assert find_begin(seen, read_log(video.with_suffix(".SRT")), "SRT").time_s == pytest.approx(0.0, abs=0.2)
     # The same flight by a track of its own clock, which the motion seen joins to the video.
     lines: list[str] = []
     request = VideoRequest(path=video, out=tmp_path, track=video.with_suffix(".gpx"), every_s=4.0, fov_deg=71.6)

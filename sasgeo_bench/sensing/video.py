@@ -159,11 +159,12 @@ def _opened(path: Path) -> cv2.VideoCapture:
     """Open a file for FFmpeg alone, by an absolute path, so that no name is taken for an address."""
     # Read when the first video of a process is opened: what is wrong with a file is told by us, in a line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    logging = getattr(cv2.utils, "logging", cv2)  # earlier releases have it in cv2 itself
+    before = logging.setLogLevel(0)
     try:
         capture = cv2.VideoCapture(str(path.resolve()), cv2.CAP_FFMPEG)
     finally:
-        cv2.utils.logging.setLogLevel(before)
+        logging.setLogLevel(before)
     if not capture.isOpened():
         raise ImageError(
             f"{path} cannot be decoded: it is damaged, or of a codec that is not read; copy it again from the drone, "

@@ -6,6 +6,8 @@ import io
 import math
 import re
 import warnings
+import zipfile
+import zlib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -80,13 +82,14 @@ class LogSource:
             raise self.fault(message, number) from error
         return (moment if moment.tzinfo else moment.replace(tzinfo=dt.UTC)).timestamp()
 
-    def check_size(self) -> None:
-        """Raise `FlightError` if there is no such file, or if it is too large."""
+    def check_size(self, most: int | None = None) -> None:
+        """Raise `FlightError` if there is no such file, or if it is larger than so many bytes (64 MiB)."""
         if not self.path.is_file():
             raise FlightError(f"there is no flight log {self.path}: check the path")
         size = self.path.stat().st_size
-        if size > MOST_BYTES:
-            raise self.fault(f"{size} bytes, at most {MOST_BYTES} are read: cut the log first")
+        most = MOST_BYTES if most is None else most
+        if size > most:
+            raise self.fault(f"{size} bytes, at most {most} are read: cut the log first")
 
     def check_count(self, count: int) -> None:
         """Raise `FlightError` for more points than are read."""
@@ -369,7 +372,7 @@ def read_gpx(path: Path) -> FlightLog:
 
 
 def read_kml(path: Path) -> FlightLog:
-    """Read the one line or track of a KML file; raise `FlightError` if it is not sound.
+    """Read the one line or track of a KML file or of a KMZ's; raise `FlightError` if it is not sound.
 
     A `LineString` has no times, a `gx:Track` has. Altitudes are heights where they are relative to the ground, and
     count from the geoid where they are absolute; others are not read, nor are angles.
@@ -487,9 +490,27 @@ def _content(source: LogSource) -> bytes:
         content = plain_file(source.path).read_bytes()
     except OSError as error:
         raise source.fault(f"cannot be read ({message_of(error)}): check its rights") from error
+    if source.path.suffix.lower() == ".kmz":
+        content = _unzipped(source, content)
     if _LONG_TAG.search(content):
         raise source.fault("a tag has more than 100000 characters: export it anew")
     return content
+
+
+def _unzipped(source: LogSource, content: bytes) -> bytes:
+    """Return the KML of a KMZ: the first in its root (OGC KML 2.3, annex C), of `MOST_BYTES` at most."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith(".kml") and "/" not in name]
+            if not names:
+                raise source.fault("holds no KML in its root: export it anew")
+            with archive.open(names[0]) as file:
+                unzipped = file.read(MOST_BYTES + 1)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, zlib.error) as error:
+        raise source.fault(f"no sound KMZ ({message_of(error)}): export it anew") from error
+    if len(unzipped) > MOST_BYTES:
+        raise source.fault(f"more than {MOST_BYTES} bytes unpacked: keep the track alone")
+    return unzipped
 
 
 def _name(element: Element) -> str:

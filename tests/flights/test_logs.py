@@ -3,6 +3,9 @@
 
 import datetime as dt
 import gzip
+import io
+import sys
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +17,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights import log_points
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import read_flight, read_log
@@ -148,6 +151,25 @@ def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(writt
     assert (above_sea.height_m, above_sea.start_s) == (None, None)  # a time without a zone
 
 
+def test_a_kmz_is_the_kml_in_its_root(written: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = LINE.format("9.52,47.14,80 9.53,47.15,90")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("files/other.kml", "<kml/>")
+        archive.writestr("doc.kml", line)
+    path = tmp_path / "a.KMZ"
+    path.write_bytes(packed.getvalue())
+    assert read_log(path).lat_deg.tolist() == read_log(written("a.kml", line)).lat_deg.tolist()
+    with monkeypatch.context() as patch:
+        patch.setattr(log_points, "MOST_BYTES", 10_000)
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("doc.kml", line + " " * 99_999)
+        assert "bytes unpacked: keep the track alone" in _refused(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("files/other.kml", line)
+    assert "holds no KML in its root" in _refused(path)
+
+
 def test_a_gpx_track_starts_in_utc_and_does_not_say_which_sea_its_elevations_count_from(written: Callable) -> None:
     log = read_log(written("a.gpx", _gpx(_points()).replace("<time>", "<ele>480.5</ele><time>")))
     assert (log.start_s, log.altitude_m.tolist(), log.altitude_of) == (START.timestamp(), [480.5] * 5, "unknown")
@@ -236,8 +258,8 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(wri
         ("a.kml", LINE.format("9,47 9,48").replace("</Document>", "<LineString/></Document>"), "2 lines or tracks"),
         ("a.kml", LINE.format("9.52, 47.14"), "point 1: longitude is no number|latitude is missing|is no longitude"),
         ("a.kml", LINE.format("9.52 47.14"), "point 1: '9.52' is no longitude, latitude and altitude"),
-        ("a.kmz", "PK",
-         r"no flight log that is read: .gpx, .kml, .srt, .csv, .pos, .*\(unzip a .kmz, export a .ulg by ulog2csv"),
+        ("a.kmz", "PK", "no sound KMZ"),
+        ("a.zip", "PK", "no flight log that is read: .gpx, .kml, .kmz, .srt, .ulg, .*.csv, .pos, .tum, .txt, .*gz are"),
     ],
 )  # fmt: skip
 def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(written, name, text, match) -> None:
@@ -384,6 +406,12 @@ def test_heights_come_from_the_log_or_are_given(written: Callable, region: Regio
         read_flight(without, region)
 
 
+def test_a_flight_that_never_leaves_the_ground_is_refused(written: Callable, region: Region) -> None:
+    path = written("a.csv", _table(region, _across(region), more=",height_m", cells=",4.5"))
+    with pytest.raises(FlightError, match=r"a\.csv never leaves the ground: 4\.5 m above it at most, 5 m are needed"):
+        read_flight(path, region)
+
+
 def test_what_is_on_the_ground_is_left_out(written: Callable, region: Region) -> None:
     places = _across(region)
     lines = _table(region, places, more=",height_m").splitlines()
@@ -448,3 +476,19 @@ def test_wishes_that_cannot_be_are_refused(written: Callable, region: Region, wi
     path = written("a.csv", _table(region, _across(region)))
     with pytest.raises(FlightError, match=next(iter(wish)).replace("_m", "-m")):
         read_flight(path, region, **({"height_m": 100.0} | wish))
+
+
+# Autopilots
+
+
+@pytest.mark.parametrize(
+    ("name", "library"), [("a.ulg", "pyulog"), ("a.bin", "pymavlink"), ("a.tlog", "pymavlink"), ("a.bag", "rosbags")]
+)
+def test_a_log_whose_library_is_not_installed_names_the_extra(
+    written: Callable, monkeypatch: pytest.MonkeyPatch, name: str, library: str
+) -> None:
+    for module in [one for one in sys.modules if one.partition(".")[0] == library]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ConfigError, match=rf"needs the package {library}: pip install 'sasgeo-bench\[logs\]'"):
+        read_log(written(name, ""))

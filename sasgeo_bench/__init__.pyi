@@ -6,6 +6,7 @@ from .boards.board import read_board as read_board
 from .boards.cases import plot_evidence as plot_evidence
 from .boards.cases import plot_query as plot_query
 from .cli.boards import score as score
+from .cli.flights import import_flight as import_flight
 from .cli.importing_photos import import_masks as import_masks
 from .cli.importing_photos import import_photos as import_photos
 from .cli.observing import locate as locate

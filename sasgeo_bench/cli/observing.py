@@ -33,7 +33,7 @@ class VideoOptions(Options):
     """Flags of commands that take a video in place of pictures."""
 
     track: Annotated[
-        Path | None, typer.Option(help="of a video: SRT, GPX, KML or CSV; default: the SRT of its name beside it")
+        Path | None, typer.Option(help="of a video: SRT, or a log that import-flight reads; default: the SRT beside it")
     ] = None
     every: Annotated[float | None, typer.Option(help=f"seconds between frames of a video; default: {EVERY_S:g}")] = None
     fov: Annotated[

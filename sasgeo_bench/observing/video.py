@@ -62,7 +62,7 @@ class VideoRequest:
     out : Path
         Root of what is made: the photos get a folder in `out/frames`.
     track : Path, optional
-        SRT, GPX, KML or a table; by default the SRT of the same name beside the video.
+        SRT, or a log of the flight; by default the SRT of the same name beside the video.
     every_s : float
         Seconds between frames.
     fov_deg : float, optional
@@ -173,7 +173,7 @@ def _no_track(video: Video) -> str:
     name, srt = plain(video.path.name), plain(video.path.with_suffix(".SRT").name)
     inside = f"take its subtitles out (ffmpeg -i {name} -map 0:s:0 {srt}), or " if video.has_subtitles else ""
     return (
-        f"{name} has no track, such as {srt} beside it: {inside}say --track FILE (SRT, GPX, KML, CSV), or locate it "
+        f"{name} has no track, such as {srt} beside it: {inside}say --track FILE (SRT, GPX, CSV, a drone's log), or locate it "
         "with --near LON,LAT or --region, --height and --fov"
     )
 
@@ -272,7 +272,7 @@ class _Track:
 
 def _read_track(path: Path) -> _Track:
     if is_tum(path):
-        raise FlightError(f"{plain(path.name)} has no longitude and latitude: name a track of SRT, GPX, KML or CSV")
+        raise FlightError(f"{plain(path.name)} has no longitude and latitude: name a track that has")
     if path.suffix.lower() == ".srt":
         said = read_srt(path)
         log, angles, film_mm, began = said.log, said.gimbal_deg, said.film_mm, said.began

@@ -173,8 +173,8 @@ def _no_track(video: Video) -> str:
     name, srt = plain(video.path.name), plain(video.path.with_suffix(".SRT").name)
     inside = f"take its subtitles out (ffmpeg -i {name} -map 0:s:0 {srt}), or " if video.has_subtitles else ""
     return (
-        f"{name} has no track, such as {srt} beside it: {inside}say --track FILE (SRT, GPX, CSV, a drone's log), or locate it "
-        "with --near LON,LAT or --region, --height and --fov"
+        f"{name} has no track, such as {srt} beside it: {inside}say --track FILE (SRT, GPX, CSV, a drone's log), or "
+        "locate it with --near LON,LAT or --region, --height and --fov"
     )
 
 

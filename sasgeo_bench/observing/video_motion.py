@@ -31,7 +31,7 @@ _LOWEST_M: Final = 2.0
 _MOVES_MPS: Final = 1.0  # below it a course is noise
 _SIGMA_S: Final = 0.05  # at the least
 _CARRIED_S: Final = 10.0  # for which turns that are seen carry a heading: they drift by a degree or two
-_MOST_SIGMA_DEG: Final = 20.0  # of a heading that is worth saying
+_MOST_SIGMA_DEG: Final = 10.0  # of a heading that is worth saying: `locate` takes those of photos for as good
 _DEGREE_M: Final = 111_195.0
 
 

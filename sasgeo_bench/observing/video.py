@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -231,7 +232,7 @@ class _Track:
     began: dt.datetime | None = None  # by the drone's clock
     notes: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def sigma_m(self) -> float | None:
         """Return the standard deviation of places that are rounded to metres; None where they are not."""
         for digits in range(2, _DIGITS):
@@ -277,15 +278,14 @@ def _read_track(path: Path) -> _Track:
         said = read_srt(path)
         log, angles, film_mm, began = said.log, said.gimbal_deg, said.film_mm, said.began
     else:
-        log, angles, film_mm, began = read_log(path), None, None, None
+        log, angles, film_mm, began = _read_log(path), None, None, None
     if log.time_s is None:
         raise FlightError(f"{plain(path.name)} has no times: name a track that has")
-    notes = [note for note in log.notes if angles is None or not note.startswith("altitude")]
+    notes = list(log.notes)
     if angles is None and log.yaw_deg is not None:
         # The gimbal follows the body's yaw, unless it is turned by hand.
         angles = np.column_stack([log.yaw_deg, np.full(len(log), -90.0), np.zeros(len(log))])
         notes.append("no angles of the camera: taken as looking straight down, its up as the drone heads")
-
     return _Track(
         path=path,
         log=log,
@@ -296,6 +296,15 @@ def _read_track(path: Path) -> _Track:
         began=began,
         notes=tuple(notes),
     )
+
+
+def _read_log(path: Path) -> FlightLog:
+    try:
+        return read_log(path)
+    except FlightError as error:
+        if "-unit" in str(error):
+            raise FlightError(f"{error}; the latter, since units of a video's track are said by its names") from error
+        raise
 
 
 @dataclass(kw_only=True)
@@ -344,7 +353,8 @@ class _Cutter:
         """Write frames without a word of where they are, and yield their times."""
         due = Due(self.request.every_s)
         label, done_s = f"seconds of {plain(self.video.path.name)}", 0
-        progress.begin(label, max(1, math.ceil(self.video.length_s or 0.0)))
+        all_s = max(1, math.ceil(self.video.length_s or 0.0))
+        progress.begin(label, all_s)
 
         def is_wanted(time_s: float) -> bool:
             nonlocal done_s
@@ -362,6 +372,7 @@ class _Cutter:
             _, data = cv2.imencode(".jpg", frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
             (folder / self._name(frame.time_s)).write_bytes(data.tobytes())
             yield frame.time_s
+        progress.advance(label, max(0, all_s - done_s))
 
     def _is_used(self, time_s: float, begin: Begin) -> bool:
         """Return whether a frame becomes a photo; count why not."""

@@ -267,6 +267,8 @@ def test_each_fault_is_one_line(made: Made, filmed: Path, tmp_path: Path) -> Non
     for path in (empty, tum):
         path.write_text("")
     text.write_text("no video")
+    table = tmp_path / "table.csv"
+    table.write_text("time_s,lat,lon,height\n0,47.1,9.5,80\n1,47.1001,9.5,80\n")
     line = tmp_path / "line.kml"
     line.write_text("<kml><LineString><coordinates>9.5,47.1 9.6,47.1</coordinates></LineString></kml>")
     other = gpx(tmp_path / "other.gpx", log_of(straight, 150.0), dt.datetime(2026, 5, 1, 10, tzinfo=dt.UTC))
@@ -277,6 +279,7 @@ def test_each_fault_is_one_line(made: Made, filmed: Path, tmp_path: Path) -> Non
         ({"path": path, "track": tmp_path / "none.gpx"}, FlightError, "there is no flight log"),
         ({"path": path, "track": tum}, FlightError, "no longitude and latitude"),
         ({"path": path, "track": line}, FlightError, "has no times"),
+        ({"path": path, "track": table}, FlightError, "name it as in height_m; the latter, since units of a video's"),
         ({"path": path, "track": other}, ConfigError, "say --fov"),
         ({"path": filmed, "track": other, "fov_deg": 70}, FlightError, "fits no one time"),
         ({"path": text, "needs_track": False}, ImageError, "is no video"),

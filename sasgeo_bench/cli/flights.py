@@ -4,7 +4,7 @@
 import datetime as dt
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -47,7 +47,7 @@ class FlightOptions(Options):
         typer.Argument(
             help="GPX, KML, KMZ, SRT, CSV, RTKLIB .pos, ULog, DataFlash, .tlog, bag, MCAP, or TUM in the region's CRS"
         ),
-    ]
+    ] = field(kw_only=False)
     region: Annotated[
         str | None, typer.Option(help="region that was flown over: id, or own file; its queries are drawn")
     ] = None

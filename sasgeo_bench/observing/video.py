@@ -8,7 +8,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -193,7 +193,7 @@ def _key(request: VideoRequest, track: Path | None) -> str:
         about.st_size,
         about.st_mtime_ns,
         None if track is None else sha256_of(track),
-        {name: value for name, value in asdict(request).items() if name not in ("path", "out", "track")},
+        (request.every_s, request.fov_deg, request.offset_s),
     ]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 

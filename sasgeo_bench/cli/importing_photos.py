@@ -19,6 +19,7 @@ from sasgeo_bench.observing.import_masks import import_masks as masks_imported
 from sasgeo_bench.observing.import_photos import GROUP, SUITE, ImportRequest
 from sasgeo_bench.observing.import_photos import import_photos as imported_by
 from sasgeo_bench.observing.masks import read_legend
+from sasgeo_bench.observing.photo_flights import OdometerName
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights
 from sasgeo_bench.tasks.query import PriorGroup
@@ -59,6 +60,10 @@ class ImportPhotosOptions(VideoOptions, PosedOptions):
         Path, typer.Argument(help="folder of photos (JPEG, TIFF, PNG, WebP, GeoTIFF), or a video (MP4, MOV)")
     ] = field(kw_only=False)
     name: Annotated[str, typer.Option(help="suite of the task")] = SUITE
+    odometry: Annotated[
+        OdometerName,
+        typer.Option(help="of flights: the truth with drawn errors, or found by matching pictures (visual)"),
+    ] = "drawn"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +114,7 @@ def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
         ...
     sasgeo_bench.core.errors.ConfigError: heights come from one source: give --height, --dem or --takeoff-height alone
     """
-    request = _request(options, options.pictures)
+    request = replace(_request(options, options.pictures), odometry=options.odometry)
     tasks = imported_by(replace(request, pictures=options.photos_of(options.pictures, options.out)))
     for task in tasks:
         options.say(task.folder)

@@ -5,7 +5,7 @@ import hashlib
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -22,6 +22,7 @@ from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results
 from sasgeo_bench.observing.video import EVERY_S, VideoRequest, is_video, video_photos
+from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
 _PAIR: Final = re.compile(r"\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*,\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*")
@@ -71,9 +72,10 @@ class SearchOptions(Options):
     pictures: Annotated[
         Path, typer.Argument(help="a picture, a folder of them (JPEG, PNG, WebP, GeoTIFF), or a video (MP4, MOV)")
     ] = field(kw_only=False)
-    region: Annotated[str | None, typer.Option(help="built region, or its folder; default: the newest that fits")] = (
-        None
-    )
+    region: Annotated[
+        str | None,
+        typer.Option(help="built region, its folder, or a packed map (*.map); default: the newest that fits"),
+    ] = None
     near: Annotated[str | None, typer.Option(help="LON,LAT of the middle of the search; default: the file's")] = None
     radius: Annotated[float, typer.Option(help="of the search, metres")] = RADIUS_M
     heading: Annotated[
@@ -131,17 +133,14 @@ def locate(options: LocateOptions) -> Located:
         ...
     sasgeo_bench.core.errors.ImageError: there is no picture or folder garden.jpg: check the path
     """
+    if options.region is not None and is_packed_map(Path(options.region)):
+        weights = unpack_map(options.region, options.out).about.weights
+        if weights is not None:
+            tell(f"what {weights.matcher} has learned is left packed: P(false fix) is calibrated without it")
     into = options.into or options.out / "locate" / _name_of(options.pictures)
     heading = None if options.heading in (None, "any") else _heading(options.heading or "")
-    told = Told(height_m=options.height, ground_width_m=options.ground_width)
-    pictures = options.photos_of(
-        options.pictures,
-        options.out,
-        needs_track=options.near is None and options.region is None,
-        needs_lens=options.ground_width is None,
-    )
     request = LocateRequest(
-        pictures=pictures,
+        pictures=options.pictures,
         out=options.out,
         into=into,
         region=None if options.region is None else built_region(options.region, options.out),
@@ -149,14 +148,20 @@ def locate(options: LocateOptions) -> Located:
         radius_m=options.radius,
         heading=heading,
         is_turned=options.heading == "any",
-        told=told,
+        told=Told(height_m=options.height, ground_width_m=options.ground_width),
         matcher=options.matcher,
         segmenter=options.segmenter,
         uses_position=options.exif_position,
         most_false=options.most_false,
         is_sandboxed=not options.trusted,
     )
-    found = located_by(request, lambda region: Strips(into, region))
+    frames = options.photos_of(
+        options.pictures,
+        options.out,
+        needs_track=request.near is None and request.region is None,
+        needs_lens=options.ground_width is None,
+    )
+    found = located_by(replace(request, pictures=frames), lambda region: Strips(into, region))
     for fix in found.fixes:
         options.say(line_of(fix))
     answered = [found.calibration] if any(fix.p_false is not None for fix in found.fixes) else []

@@ -48,7 +48,7 @@ class FlightOptions(Options):
     file: Annotated[
         Path,
         typer.Argument(
-            help="GPX, KML, KMZ, CSV, RTKLIB .pos, ULog, DataFlash, .tlog, bag, MCAP, or TUM in the region's CRS"
+            help="GPX, KML, KMZ, SRT, CSV, RTKLIB .pos, ULog, DataFlash, .tlog, bag, MCAP, or TUM in the region's CRS"
         ),
     ] = field(kw_only=False)
     region: Annotated[
@@ -338,7 +338,10 @@ def _summary(flown: Trajectory) -> str:
 def _lines(log: FlightLog, speed_mps: float) -> Iterator[str]:
     """Yield what was read of a log."""
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
-    lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
+    lasts = "no times"
+    if log.time_s is not None:
+        lasts_s = float(log.time_s[-1] - log.time_s[0])  # an SRT counts from the video's begin
+        lasts = f"{lasts_s:.1f} s, {way_m / lasts_s:.2f} m/s on average"
     yield f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}"
     if log.start_s is not None:
         yield f"starts at {dt.datetime.fromtimestamp(log.start_s, tz=dt.UTC).isoformat(timespec='milliseconds')}"

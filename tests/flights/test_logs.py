@@ -241,7 +241,7 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(wri
         ("a.gpx", EXTERNAL.format(f"<gpx>{POINT.format(1, 2, '<time>&e;</time>')}</gpx>"), "has a document type or"),
         ("a.kml", EXTERNAL.format(LINE.format("&e;")), "has a document type or entities"),
         ("a.gpx", "<gpx><trk>", "no sound XML"),
-        ("a.gpx", "<gpx>" + "<a>" * 9000, "more than 3000000 elements, or 64 in each other: keep the track alone"),
+        ("a.gpx", "<gpx>" + "<a>" * 9000, "more than 10000000 elements, or 64 in each other: keep the track alone"),
         ("a.gpx", _gpx(_points()).replace("<time>", "<time/><time>"), "point 1: time is no date and time"),
         ("a.gpx", "<gpx/>", "two points at least, the log has 0"),
         ("a.gpx", _gpx(_points()).replace("</trk>", "</trk><trk></trk>"), "more than one track"),

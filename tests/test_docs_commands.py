@@ -58,7 +58,7 @@ ONLY_PARSED = {
     r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",
     r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/cli/test_cli_runs.py does it",
     r"^sasgeo-bench read-flight ": "needs a log of the reader's own; tests/cli/test_cli_flights.py reads some",
-    r"^sasgeo-bench measure-drift .*\.ulg": "needs a log of the reader's own; tests/cli/test_cli_flights.py writes some",
+    r"^sasgeo-bench measure-drift .*\.ulg": "needs a log of the reader's own; tests/cli/test_cli_flights.py has some",
     r"--train ": "needs a matcher that learns; tests/running does it",
     r"FILE\.json|<hash>": "needs what a matcher has learnt",
     r"HASH|--query ID": "needs a run or a query of the reader's own; tests/boards/test_board_pictures.py does it",

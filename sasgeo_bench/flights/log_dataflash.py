@@ -320,14 +320,16 @@ def _streams_of(messages: Messages) -> Streams:
         fixes=fixes,
         heights=heights,
         attitudes=attitudes_of(messages),
-        clock=_clock(messages),
+        clock=_clock(messages, fixes.track.name),
         notes=(*notes, *messages.notes),
     )
 
 
-def _clock(messages: Messages) -> Clock | None:
-    """Return UTC by weeks of GPS; a receiver without a week does not know it yet."""
-    for name, columns in (*messages.instances("GPS"), *messages.instances("GPS2")):
+def _clock(messages: Messages, first: str) -> Clock | None:
+    """Return UTC by weeks of the receiver that is read, else of another; one without a week does not know it yet."""
+    receivers = dict((*messages.instances("GPS"), *messages.instances("GPS2")))
+    for name in sorted(receivers, key=lambda name: name != first):
+        columns = receivers[name]
         week, ms = (columns.get(new, columns.get(old)) for new, old in (("GWk", "Week"), ("GMS", "TimeMS")))
         if week is None or ms is None or not (week > 0).any():
             continue

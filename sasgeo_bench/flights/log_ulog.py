@@ -162,7 +162,7 @@ def streams_of(topics: Topics) -> Streams:
         fixes=fixes,
         heights=heights,
         attitudes=attitudes_of(topics),
-        clock=_clock(topics),
+        clock=_clock(topics, fixes.track.name),
         notes=(*notes, *topics.notes),
     )
 
@@ -275,16 +275,13 @@ def _without_receiver(topics: Topics) -> tuple[tuple[tuple[float, float], ...], 
     return free_stretches(found), name
 
 
-def _clock(topics: Topics) -> Clock | None:
-    """Return UTC by the first receiver that knows it; `time_ref_utc` of the file is an offset of the pilot's choice."""
-    for name in _RECEIVERS:
-        for called, columns in topics.instances(name):
-            utc_us = np.asarray(columns.get("time_utc_usec", np.empty(0)), dtype=np.float64)
-            if (utc_us > 0).any():
-                is_known = utc_us > 0
-                return Clock(
-                    name=f"time_utc_usec of {called}",
-                    time_s=seconds(columns)[is_known],
-                    utc_s=utc_us[is_known] / 1e6,
-                )
+def _clock(topics: Topics, first: str) -> Clock | None:
+    """Return UTC by the receiver that is read, else by another; `time_ref_utc` is an offset of the pilot's choice."""
+    receivers = dict(one for name in _RECEIVERS for one in topics.instances(name))
+    for name in sorted(receivers, key=lambda name: name != first):
+        utc_us = np.asarray(receivers[name].get("time_utc_usec", np.empty(0)), dtype=np.float64)
+        is_known = utc_us > 0
+        if is_known.any():
+            time_s = seconds(receivers[name])[is_known]
+            return Clock(name=f"time_utc_usec of {name}", time_s=time_s, utc_s=utc_us[is_known] / 1e6)
     return None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flights out of files: GPX, KML, tables with latitude and longitude, TUM; brought onto a region and cut to it."""
+"""Flights out of files: GPX, KML, tables, TUM, logs of autopilots; brought onto a region and cut to it."""
 
 import math
 from dataclasses import replace
@@ -51,7 +51,7 @@ _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
 def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | None = None) -> FlightLog:
-    """Read a log by its suffix (GPX, KML, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
+    """Read a log by its suffix, one of `SUFFIXES`, or the folder of a bag; raise `FlightError` if it is not sound.
 
     `facts` say what a table does not; what they say of a file without it is refused. A line drawn in KML has no times:
     `read_flight` flies it at an even speed. A `height_m` replaces the log's heights.
@@ -128,8 +128,8 @@ def read_flight(
     Parameters
     ----------
     path : Path
-        GPX, KML, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting, northing and height
-        of the region's CRS.
+        Of one of `SUFFIXES`, or the folder of a bag. Positions of TUM (.tum, .txt) are easting, northing and height of
+        the region's CRS.
     region : Region
         The stretch lies over its mapped ground.
     margin_m : float

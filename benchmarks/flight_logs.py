@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and memory of reading flight logs: whole processes of `read-flight` on logs that this script writes.
+"""Time and memory of reading flight logs: whole processes of `import-flight` on logs that this script writes.
 
 Logs of 20 minutes have the messages of a usual flight around those that are read (1,000 a second); logs of a million
 rows have a fix in each. `python benchmarks/flight_logs.py [FOLDER]`; needs the extra [logs] and 1 GB on disk.
@@ -147,11 +147,11 @@ def measure(path: Path) -> tuple[float, float, float]:
     """Return seconds by the clock and of processor, and peak megabytes, of one process that reads a log."""
     start = time.perf_counter()
     process = subprocess.Popen(  # noqa: S603 - our own program
-        [sys.executable, "-c", PROGRAM, "read-flight", str(path)], stdout=subprocess.DEVNULL
+        [sys.executable, "-c", PROGRAM, "import-flight", str(path)], stdout=subprocess.DEVNULL
     )
     _, status, used = os.wait4(process.pid, 0)
     if status:
-        raise SystemExit(f"read-flight {path} failed")
+        raise SystemExit(f"import-flight {path} failed")
     return time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / 1e6
 
 

@@ -21,10 +21,10 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.core.errors import SasgeoError
-from sasgeo_bench.observing.chances import Answers, Chances, shipped_answers
+from sasgeo_bench.observing.chances import Answers, Chances, StoredFit, shipped_answers
 from sasgeo_bench.running.prediction_files import read_predictions
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
-from sasgeo_bench.sasgeo.rejectors import is_none, lead
+from sasgeo_bench.sasgeo.rejectors import FittedModel, is_none, lead
 from sasgeo_bench.scoring.intervals import wilson_share
 from sasgeo_bench.tasks.query import Truth, base_of
 from sasgeo_bench.tasks.task_files import Task
@@ -97,7 +97,7 @@ def left_out(answers: Answers) -> "tuple[np.ndarray, np.ndarray]":
     p_false = np.zeros(len(place))
     items = answers.predictions()
     for number, name in enumerate(answers.places):
-        chances = Chances.of(answers, without=[name])
+        chances = Chances.fitted(answers, without=[name])
         here = np.flatnonzero(place == number)
         p_false[here] = chances.rejector.p_false([items[at] for at in here])
     return p_false, place
@@ -128,6 +128,14 @@ def tables(answers: Answers) -> Iterator[str]:
         )
 
 
+def with_fit(answers: Answers) -> Answers:
+    """Return answers with the fit on all of them, which `locate` reads."""
+    rule = Chances.fitted(answers).rejector.rule
+    if not isinstance(rule, FittedModel):
+        raise SystemExit("too few right or false answers for a fit: make a larger board")
+    return answers.model_copy(update={"fit": StoredFit.of(rule)})
+
+
 def main() -> None:
     """Print the tables, and write the file if asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -139,7 +147,7 @@ def main() -> None:
         print(answers.text, Counter(answers.is_false.tolist()))
         print("\n".join(tables(answers)))
     if given.write:
-        text = json.dumps([item.model_dump(mode="json") for item in found], separators=(",", ":"))
+        text = json.dumps([with_fit(item).model_dump(mode="json") for item in found], separators=(",", ":"))
         given.write.write_text(text.replace("],[", "],\n[") + "\n", encoding="utf-8")
 
 

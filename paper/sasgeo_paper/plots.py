@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.canvas import GREY, Page, page, panels, without_ticks
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import class_keys
-from sasgeo_bench.tasks.sheet import HIDDEN, Panel, paint
+from sasgeo_bench.regions.preview import HIDDEN, class_keys, paint_evidence
+from sasgeo_bench.tasks.sheet import Panel
 
 # Okabe and Ito's colours, distinct for colour-blind readers; marks and dashes differ too.
 _COLOURS: Final = ("#e69f00", "#0072b2", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#000000", "#f0e442")
@@ -57,10 +57,10 @@ def draw_example(path: Path, panel: Panel, *, data: str) -> None:
     )
     with page(path, about) as charts:
         pictures = (
-            ("query: what is seen", paint(query.evidence)),
+            ("query: what is seen", paint_evidence(query.evidence)),
             ("observability mask", _mask(query.evidence)),
-            ("true reference: the map there", None if panel.at_truth is None else paint(panel.at_truth)),
-            ("hardest decoy: the map there", None if panel.at_decoy is None else paint(panel.at_decoy)),
+            ("true reference: the map there", None if panel.at_truth is None else paint_evidence(panel.at_truth)),
+            ("hardest decoy: the map there", None if panel.at_decoy is None else paint_evidence(panel.at_decoy)),
         )
         for chart, (name, picture) in zip(charts[0], pictures, strict=True):
             chart.set_title(name)

@@ -56,7 +56,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.regions.evidence import CERTAIN, UNKNOWN, Evidence, LayerBits, footprint, observe
 from sasgeo_bench.regions.layers import PRESENT
-from sasgeo_bench.regions.preview import GROUND, class_keys, paint_overview, pooled, scale_bar
+from sasgeo_bench.regions.preview import GROUND, HIDDEN, class_keys, paint_evidence, paint_overview, pooled, scale_bar
 from sasgeo_bench.regions.region import Manifest, Region
 from sasgeo_bench.scoring.base import Bools
 from sasgeo_bench.scoring.contrasts import Contrast
@@ -65,7 +65,6 @@ from sasgeo_bench.scoring.rejection import OWN
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.query import Query, Truth, base_of
 from sasgeo_bench.tasks.segmented import Segmented
-from sasgeo_bench.tasks.sheet import HIDDEN, paint
 
 BOTH: Final = "also without the stress"
 SEVERAL: Final = "one of several"
@@ -195,6 +194,15 @@ def count_cases(cases: pd.DataFrame) -> dict[str, int]:
     """Return the number of failures of each class."""
     counts = cases["failure"].value_counts()
     return {name: int(counts.get(name, 0)) for name in FAILURES}
+
+
+def count_turned(scores: pd.DataFrame) -> int:
+    """Return the number of right fixes whose heading is off by more than success allows; no failure holds them.
+
+    >>> count_turned(pd.DataFrame({"is_right": [True, True, False], "yaw_error_deg": [4.0, 6.0, 90.0]}))
+    1
+    """
+    return int((scores["is_right"].astype(bool) & (scores["yaw_error_deg"] > SUCCESS_DEG)).sum())
 
 
 class Words(TypedDict):
@@ -440,7 +448,7 @@ def draw_panel(chart: Axes, name: str, evidence: Evidence | None) -> None:
     if evidence is None:
         chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=8, color=GREY, transform=chart.transAxes)
     else:
-        chart.imshow(paint(evidence), interpolation="antialiased")
+        chart.imshow(paint_evidence(evidence), interpolation="antialiased")
 
 
 def draw_picture(chart: Axes, picture: NDArray[np.uint8]) -> None:
@@ -669,7 +677,7 @@ def plot_evidence(evidence: Evidence, *, title: str = "evidence of one view", da
         about = Page(title=title, facts=facts, data=data, keys=evidence_keys(shown), columns=2 * count)
         charts = figure.framed(about).subplots(1, count, squeeze=False)[0]
         extent = (0.0, width_m, 0.0, height_m)
-        charts[0].imshow(paint(evidence), extent=extent, interpolation="nearest")
+        charts[0].imshow(paint_evidence(evidence), extent=extent, interpolation="nearest")
         charts[0].set_title(f"view, {width_m:.0f} m across", fontsize=7.5)
         scale_bar(charts[0], width_m, height_m)
         if evidence.confidence is not None:

@@ -11,22 +11,28 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.boards.board_files import BOARD, read_board_manifest, read_scores
-from sasgeo_bench.boards.cases import case_pixels, count_cases, sample_cases, write_png
+from sasgeo_bench.boards.cases import case_pixels, count_cases, count_turned, sample_cases, write_png
+from sasgeo_bench.boards.flight_page import flight_page
 from sasgeo_bench.boards.flight_plots import flight_map_pixels
 from sasgeo_bench.boards.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
 from sasgeo_bench.boards.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
+from sasgeo_bench.cli.built_regions import find_built
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
-from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
+from sasgeo_bench.cli.targets import find_task, is_split, no_target
 from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import read_overview
+from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.rows import base_name
+from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.query import BY, SEQUENCE_DIGITS
 from sasgeo_bench.tasks.sheet import flight_panels, panels_of, write_flight_sheet, write_sheet
@@ -65,7 +71,10 @@ class InspectOptions(Options):
 def inspect_command(
     target: Annotated[
         str,
-        typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one, a run or a board"),
+        typer.Argument(
+            help="a built region, a packed map (*.map), a task (SUITE/REGION), a split, or the folder of one, a run or "
+            "a board"
+        ),
     ],
     options: InspectOptions,
 ) -> None:
@@ -95,6 +104,8 @@ def inspect_command(
         _inspect_split(target, out, folders)
         return
     manifest = read_manifest(region_folder)
+    if is_packed_map(Path(target)):
+        say(f"{target}: {unpack_map(target, out).about.to_text()}")
     print_table(_summary(manifest, region_folder, _preview(manifest, region_folder, out)))
     print_table(_class_table(manifest))
     if (reasons := _reasons(manifest)).row_count:
@@ -201,6 +212,12 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | Non
     only = f", {stressed} of the queries under stress: boards count these first, and controls apart" if stressed else ""
     say(f"{cases.entry.name}: {counted(len(found), 'failure')} in {counted(total, 'query', 'queries')}{only}")
     print_table(table)
+    turned = count_turned(cases.scores)
+    if turned:
+        say(
+            f"{counted(turned, 'more query is', 'more queries are')} within {FIX_M:g} m of the place with a heading "
+            f"more than {SUCCESS_DEG:g} degrees off: within_25m counts them, success_25m does not"
+        )
 
 
 def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
@@ -225,6 +242,11 @@ def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
     path = _sheet(out, cases.entry.name, str(row["query_id"]))
     write_png(path, flight_map_pixels(task, str(row["query_id"]), views))
     say(f"map of {'the worst flight' if query is None else 'the flight'}: {path}")
+    playing = path.with_suffix(".html")
+    text = flight_page(task, str(row["query_id"]), cases.entry.name, cases.flights[key].views, cases.predictions)
+    with fresh_file(playing, mend="name another --out, or free some space") as scratch:
+        scratch.write_text(text, encoding="utf-8")
+    say(f"page that plays it: {playing}")
     return query is not None
 
 

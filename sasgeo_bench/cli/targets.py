@@ -8,6 +8,7 @@ from typing import Final
 
 from sasgeo_bench.boards.board_files import BOARD
 from sasgeo_bench.boards.run_cases import is_run
+from sasgeo_bench.cli.built_regions import MOST_NAMED
 from sasgeo_bench.core.errors import ConfigError, named
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.regions.region_spec import list_region_files
@@ -18,7 +19,6 @@ from sasgeo_bench.tasks.split import list_split_files
 from sasgeo_bench.tasks.suites.all_suites import list_suites
 from sasgeo_bench.tasks.task_files import TASK
 
-MOST_NAMED: Final = 8
 _ELSEWHERE: Final = {  # what else a folder may be, by a file in it, and the command for it
     BOARD: "a board: publish --board {0} makes a site of it",
     SUBMISSION: "a submission: verify {0} --for BOARD checks it",
@@ -28,23 +28,6 @@ _ELSEWHERE: Final = {  # what else a folder may be, by a file in it, and the com
 def find_task(target: str, out: Path) -> Path | None:
     """Return the folder of a task, given as it is or as SUITE/REGION; None if it is no task."""
     return next((folder for folder in (Path(target), out / "tasks" / target) if (folder / TASK).is_file()), None)
-
-
-def find_built(target: str, out: Path) -> Path | None:
-    """Return the folder of a built region, given as it is or by its name; None if it is no region."""
-    return next((folder for folder in (Path(target), out / "regions" / target) if (folder / MANIFEST).is_file()), None)
-
-
-def built_region(name: str, out: Path) -> Path:
-    """Return the folder of a built region, by its name or itself; a refusal suggests the nearest, or lists all."""
-    found = find_built(name, out)
-    if found is not None:
-        return found
-    built = sorted(path.parent.name for path in (out / "regions").glob(f"*/{MANIFEST}"))
-    near = difflib.get_close_matches(name, built, n=1)
-    there = f"; built are {named(built, 'region', most=MOST_NAMED)}" if built else ""
-    hint = f"did you mean {near[0]!r}?" if near else f"build-region it first{there}"
-    raise ConfigError(f"{out / 'regions'} holds no region {name!r}: {hint}")
 
 
 def is_split(target: str) -> bool:

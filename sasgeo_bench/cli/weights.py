@@ -9,9 +9,9 @@ import pandas as pd
 import typer
 from rich.table import Table
 
+from sasgeo_bench.cli.built_regions import built_region
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out
-from sasgeo_bench.cli.targets import built_region
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.cards import WHERE, read_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy

@@ -2,11 +2,12 @@
 """P(false fix) of a user's pictures: fitted on answers to real pictures that taught the segmenter nothing."""
 
 import hashlib
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
 import numpy as np
 from pydantic import Field
@@ -14,11 +15,57 @@ from pydantic import Field
 from sasgeo_bench.core.config import JsonDocument, check_document
 from sasgeo_bench.core.json import parse_json
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.matcher import Prediction, Rejector
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.observing.pictures import OwnPicture, Sight
+from sasgeo_bench.sasgeo.rejectors import FittedModel, Frame, Linear, SasgeoLogistic
 
 FILE: Final = "chances.json"
 _AWAY_M: Final = 1000.0  # where the rival of a stored answer stands: outside any tolerance
+
+
+class StoredFit(JsonDocument):
+    """The fit of `sasgeo_logistic` on all rows of `Answers`, so that `locate` fits nothing; a spread of None: no end.
+
+    `benchmarks/own_pictures.py --write` stores it.
+    """
+
+    medians: tuple[float, ...]
+    is_flagged: tuple[bool, ...]
+    means: tuple[float, ...]
+    spreads: tuple[float | None, ...]
+    weights: tuple[float, ...]
+    intercept: float
+    answers: int
+
+    @classmethod
+    def of(cls, model: FittedModel) -> Self:
+        """Return a fit as it is stored."""
+        frame, line = model.frame, model.log_odds
+        if not isinstance(line, Linear):
+            raise TypeError(f"no logistic fit: {line!r}")
+        return cls(
+            medians=tuple(frame.medians.tolist()),
+            is_flagged=tuple(frame.is_flagged.tolist()),
+            means=tuple(frame.means.tolist()),
+            spreads=tuple(value if math.isfinite(value) else None for value in frame.spreads.tolist()),
+            weights=tuple(line.weights.tolist()),
+            intercept=line.intercept,
+            answers=model.answers,
+        )
+
+    def model(self) -> FittedModel:
+        """Return the fit."""
+        frame = Frame(
+            medians=np.array(self.medians),
+            is_flagged=np.array(self.is_flagged, dtype=bool),
+            means=np.array(self.means),
+            spreads=np.array([math.inf if value is None else value for value in self.spreads]),
+        )
+        return FittedModel(
+            frame=frame,
+            log_odds=Linear(weights=np.array(self.weights), intercept=self.intercept),
+            answers=self.answers,
+        )
 
 
 class Answers(JsonDocument):
@@ -42,6 +89,7 @@ class Answers(JsonDocument):
     most_scale_sigma: float
     diagnostics: tuple[str, ...]
     rows: Annotated[tuple[tuple[float | None, ...], ...], Field(min_length=1)]
+    fit: StoredFit | None = None
 
     def predictions(self) -> list[Prediction]:
         """Return the answers as a rejector reads them: a first pose, and a rival by its lead."""
@@ -117,13 +165,18 @@ class Chances:
     """A rejector that was fitted on stored answers."""
 
     answers: Answers
-    rejector: Rejector
+    rejector: SasgeoLogistic
 
     @classmethod
-    def of(cls, answers: Answers, *, without: Sequence[str] = ()) -> "Chances":
-        """Fit `sasgeo_logistic`, without the answers of some places if these are named."""
-        from sasgeo_bench.sasgeo.rejectors import SasgeoLogistic  # noqa: PLC0415 - scikit-learn takes a second
+    def of(cls, answers: Answers) -> "Chances":
+        """Return `sasgeo_logistic` as its fit is stored, or fitted where none is."""
+        if answers.fit is None:
+            return cls.fitted(answers)
+        return cls(answers=answers, rejector=SasgeoLogistic(answers.fit.model()))
 
+    @classmethod
+    def fitted(cls, answers: Answers, *, without: Sequence[str] = ()) -> "Chances":
+        """Fit `sasgeo_logistic`, without the answers of some places if these are named."""
         kept = [answers.places[int(row[0] or 0)] not in without for row in answers.rows]
         items = [item for item, is_kept in zip(answers.predictions(), kept, strict=True) if is_kept]
         rejector = SasgeoLogistic()

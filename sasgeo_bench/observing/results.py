@@ -27,12 +27,11 @@ from sasgeo_bench.observing.fixes import COLUMNS, Fix, Located, Seen, Watch
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.layers import read_layers, read_overview
-from sasgeo_bench.regions.preview import paint_overview, pooled
+from sasgeo_bench.regions.preview import HIDDEN, paint_evidence, paint_overview, pooled
 from sasgeo_bench.regions.region_files import LAYERS, read_manifest
 from sasgeo_bench.sensing.birdseye import rectify
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.tasks.segmented import Segmented
-from sasgeo_bench.tasks.sheet import HIDDEN, paint
 
 TABLE: Final = "locate.csv"
 PAGE: Final = "index.html"
@@ -85,8 +84,8 @@ def strip(seen: Seen, there: Evidence | None) -> NDArray[np.uint8]:
         )
         for picture in (sight.image.rgb, over)
     ]
-    panels.append(_bytes(paint(seen.evidence)))
-    panels.append(np.full_like(panels[0], 235) if there is None else _bytes(paint(there)))
+    panels.append(_bytes(paint_evidence(seen.evidence)))
+    panels.append(np.full_like(panels[0], 235) if there is None else _bytes(paint_evidence(there)))
     gap = np.full((_PANEL_PX, 6, 3), 255, dtype=np.uint8)
     fitted = [cv2.resize(one, (_PANEL_PX, _PANEL_PX), interpolation=cv2.INTER_AREA) for one in panels]
     return np.concatenate([part for one in fitted for part in (one, gap)][:-1], axis=1)

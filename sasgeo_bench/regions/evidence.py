@@ -3,7 +3,8 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Self
+from importlib import import_module
+from typing import TYPE_CHECKING, Final, Self, cast
 
 import numpy as np
 import shapely
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ABSENT: Final = 0
 PRESENT: Final = 1
@@ -198,6 +202,11 @@ class Evidence:
         return self.replace(
             cells, None if self.confidence is None else np.where(is_unknown, np.uint8(CERTAIN), self.confidence)
         )
+
+    def plot(self, *, title: str = "evidence of one view", data: str = "not stated") -> "Figure":
+        """Draw what was seen in one call, and how much is known; see `sgb.plot_evidence`."""
+        # By its public name: the drawing stands below in the order of folders
+        return cast("Figure", import_module("sasgeo_bench").plot_evidence(self, title=title, data=data))
 
     def layer(self, class_name: str) -> NDArray[np.uint8]:
         """Return the cells of one class, shape (rows, cols)."""

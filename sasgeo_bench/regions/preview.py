@@ -20,11 +20,13 @@ from numpy.typing import NDArray
 from sasgeo_bench.core.canvas import PlainFigure
 from sasgeo_bench.core.errors import check_given
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
 from sasgeo_bench.regions.region import Manifest, Region
 
 PAINT_ORDER: Final = load_taxonomy().painted
 GROUND: Final = "#fbfaf5"
+HIDDEN: Final = "#9e9e9e"  # of what was not seen
 _UNMAPPED: Final = ("#d9d9d9", "#c4c4c4")
 _STRIPE_CELLS: Final = 12
 _DPI: Final = 110
@@ -169,6 +171,18 @@ def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[n
     picture[outside] = to_rgb(_UNMAPPED[0])
     picture[outside & is_stripe] = to_rgb(_UNMAPPED[1])
     return picture
+
+
+def paint_evidence(evidence: Evidence) -> NDArray[np.float64]:
+    """Return colours of a view, shape (rows, cols, 3), 0..1; grey in proportion to the unknown classes."""
+    picture = np.empty((*evidence.shape, 3))
+    picture[:] = to_rgb(GROUND)
+    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
+    for name in PAINT_ORDER:
+        if name in evidence.classes:
+            picture[evidence.layer(name) == PRESENT] = colours[name]
+    unknown = (evidence.cells == UNKNOWN).mean(axis=0)[..., None]
+    return np.asarray(picture * (1 - unknown) + np.array(to_rgb(HIDDEN)) * unknown)
 
 
 def scale_bar(chart: Axes, width_m: float, height_m: float) -> None:

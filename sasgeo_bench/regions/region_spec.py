@@ -29,6 +29,7 @@ from sasgeo_bench.osm.vector import ClassTable
 from sasgeo_bench.regions.imagery import ImageryEntry
 from sasgeo_bench.regions.region import LICENCE, Provenance
 
+OWN_FOLDER: Final = Path("my-regions")  # where new-region writes
 MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
 MAX_LONGITUDE_DEG: Final = 180.0
 MAX_AREA_KM2: Final = 100_000.0
@@ -466,12 +467,19 @@ def list_region_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
 def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     """Find a region file by its id, or return the path of one; raise as `find_document` does.
 
+    Of ids that are in none of the folders, nor in the package, that in `OWN_FOLDER` is taken.
+
     >>> find_region_file("vadus")
     Traceback (most recent call last):
         ...
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
     """
-    return find_document(id_or_path, "region", "list regions shows all", lambda: list_region_files(folders=folders))
+    own = OWN_FOLDER / f"{id_or_path}.toml"
+
+    def known() -> dict[str, Path]:
+        return ({id_or_path: own} if own.is_file() else {}) | list_region_files(folders=folders)
+
+    return find_document(id_or_path, "region", "list regions shows all", known)
 
 
 def region_text(

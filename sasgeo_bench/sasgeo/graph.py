@@ -30,7 +30,7 @@ class GraphRules:
     """Tolerances and likelihood ratios of nodes and of their relations.
 
     The defaults are starting values: guesses from how far maps and odometry are off, before any view was seen.
-    `rejectors.fit_rules` replaces the ratios, hits and extra nodes by statistics of training views; tolerances stay.
+    `rule_fitting.fit_rules` replaces the ratios, hits and extra nodes by statistics of training views; tolerances stay.
 
     Parameters
     ----------

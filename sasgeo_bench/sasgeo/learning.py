@@ -26,7 +26,7 @@ from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, Tally, rings, tally
 from sasgeo_bench.sasgeo.reading import Reader, age_years
-from sasgeo_bench.sasgeo.rejectors import BLANK, fit_rules
+from sasgeo_bench.sasgeo.rule_fitting import BLANK, fit_rules
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel, fit_scaling
 from sasgeo_bench.sasgeo.weights import StampTally, fit_trust, stamp_tally, strata
 from sasgeo_bench.search.find import search

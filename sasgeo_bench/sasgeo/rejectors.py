@@ -4,74 +4,19 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
-from sklearn.ensemble import GradientBoostingClassifier  # type: ignore[import-untyped, unused-ignore]
-from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]
 
 from sasgeo_bench.matching.matcher import Prediction, RejectorCard
 from sasgeo_bench.sasgeo.conformal import upper_rate
-from sasgeo_bench.sasgeo.graph import START, GraphRules, Matching
 from sasgeo_bench.sasgeo.integrity import APART_M, EVIDENCE, Diagnostic
-from sasgeo_bench.sasgeo.nodes import Ints
 
-WEIGHT: Final = 30.0  # observations that a starting value counts as
-_LEAST_SHARE: Final = 0.01  # and most, 1 less it
-# While rules are estimated degrees say nothing: else nodes of wrong places would be matched where their degrees agree,
-# and agreement would look common there.
-BLANK: Final = replace(START, degrees=(0.0,) * len(START.degrees))
-
-
-def fit_rules(right: Sequence[Matching], wrong: Sequence[Matching]) -> GraphRules:
-    """Estimate the rules from matchings at the true poses of views, and at wrong poses that a search found.
-
-    Ratios of degrees and links are the logarithms of their frequencies at right poses over those at wrong ones, hits
-    and extra nodes are frequencies.
-    """
-    hit, extra = _kinds(np.sum([one.kinds for one in right], axis=0))
-    links = _ratios([one.links for one in right], [one.links for one in wrong], _LINKS)
-    return replace(
-        START,
-        degrees=_ratios([one.degrees for one in right], [one.degrees for one in wrong], START.degrees),
-        link=links[0],
-        false_link=links[1],
-        lost_link=links[2],
-        hit=hit,
-        extra=extra,
-    )
-
-
-_LINKS: Final = (START.link, START.false_link, START.lost_link)
-
-
-def _share(count: int, total: int, start: float) -> float:
-    return float(np.clip((count + WEIGHT * start) / (total + WEIGHT), _LEAST_SHARE, 1 - _LEAST_SHARE))
-
-
-def _kinds(counts: Ints) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return hits and extra nodes of each kind, from `Matching.kinds`."""
-    due, matched, seen, free = counts.tolist()
-    hit = tuple(map(_share, matched, due, START.hit))
-    return hit, tuple(map(_share, free, seen, START.extra))
-
-
-def _ratios(right: Sequence[Ints], wrong: Sequence[Ints], start: Sequence[float]) -> tuple[float, ...]:
-    """Return log ratios of the frequencies of some outcomes, right over wrong, mixed with starting values."""
-    # One observation of each outcome is shared out by the totals, so that what was never seen has ratio 0. A ratio
-    # counts by its precision, a starting value as known to within one nat.
-    here, there = (np.sum([*counts, np.zeros(len(start))], axis=0) for counts in (right, wrong))
-    if not (here.sum() and there.sum()):
-        return tuple(start)
-    total = here.sum() + there.sum()
-    here, there = here + here.sum() / total, there + there.sum() / total
-    found = np.log(here / here.sum()) - np.log(there / there.sum())
-    precision = here * there / (here + there)
-    return tuple(((precision * found + np.array(start)) / (precision + 1)).tolist())
-
+if TYPE_CHECKING:
+    from sklearn.ensemble import GradientBoostingClassifier  # type: ignore[import-untyped, unused-ignore]
 
 Rows = NDArray[np.float64]
 
@@ -168,14 +113,40 @@ _FOLDS: Final = 4
 LogOdds = Callable[[Rows], NDArray[np.float64]]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Linear:
+    """Log-odds that are linear in features: a weight for each, shape (F,), and what they are where all are 0."""
+
+    weights: NDArray[np.float64]
+    intercept: float
+
+    def __call__(self, rows: Rows) -> NDArray[np.float64]:
+        """Return the log-odds of rows, shape (N,)."""
+        return np.asarray(rows @ self.weights + self.intercept)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedModel:
+    """Log-odds of a false fix, fitted on so many answers of calibration."""
+
+    frame: Frame
+    log_odds: LogOdds
+    answers: int
+
+    def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
+        """Return the probability of a false fix, shape (N,)."""
+        chance = special.expit(self.log_odds(self.frame.filled(features(answers))))
+        return np.asarray((self.answers * chance + 1.0) / (self.answers + 2.0))
+
+
 class _Fitted(ABC):
     """Base of both rules: choice of calibration answers, and a fallback where no fit is possible."""
 
     card: RejectorCard
 
-    def __init__(self) -> None:
+    def __init__(self, rule: FittedModel | None = None) -> None:
         self.remark = ""
-        self._rule: _FittedModel | Counted | None = None
+        self.rule: FittedModel | Counted | None = rule
 
     @abstractmethod
     def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> LogOdds:
@@ -189,7 +160,7 @@ class _Fitted(ABC):
         false = int(truth.sum())
         self.remark = ""
         if min(false, len(truth) - false) < FEW:
-            self._rule = Counted(margins=np.sort([lead(item) for item in answers]), false=false)
+            self.rule = Counted(margins=np.sort([lead(item) for item in answers]), false=false)
             self.remark = (
                 f"{false} of {len(truth)} calibration answers are false, a fit needs {FEW} of each kind: "
                 "ranked by margin, with the bounds that the counts support"
@@ -197,17 +168,17 @@ class _Fitted(ABC):
         else:
             raw = features(answers)
             frame = Frame.of(raw)
-            self._rule = _FittedModel(frame=frame, log_odds=self.learn(frame.filled(raw), truth), answers=len(truth))
+            self.rule = FittedModel(frame=frame, log_odds=self.learn(frame.filled(raw), truth), answers=len(truth))
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
         """Return the probability of a false fix, shape (N,); 1 where there is no answer."""
-        if self._rule is None:
+        if self.rule is None:
             raise RuntimeError(f"{self.card.name}: call fit() with answers of calibration blocks before p_false()")
         found = np.ones(len(predictions))
         at = [index for index, item in enumerate(predictions) if not is_none(item)]
         if at:
             # 12 decimals of a probability: the last digits of a fit depend on memory alignment
-            found[at] = self._rule.p_false([predictions[index] for index in at]).round(12)
+            found[at] = self.rule.p_false([predictions[index] for index in at]).round(12)
         return found
 
 
@@ -239,8 +210,7 @@ class SasgeoLogistic(_Fitted):
 
     def learn(self, rows: Rows, is_false: NDArray[np.bool_]) -> LogOdds:
         """Fit the weights."""
-        fitted: LogOdds = _logistic(rows, is_false).decision_function
-        return fitted
+        return _logistic(rows, is_false)
 
 
 class SasgeoBoosted(_Fitted):
@@ -271,20 +241,8 @@ class SasgeoBoosted(_Fitted):
         for part, tree in enumerate(trees):
             unseen[fold == part] = tree.decision_function(rows[fold == part])
         line = _logistic(unseen[:, None], is_false)
-        slope, shift = float(line.coef_[0, 0]), float(line.intercept_[0])
+        slope, shift = float(line.weights[0]), line.intercept
         return lambda new: np.asarray(slope * np.mean([tree.decision_function(new) for tree in trees], axis=0) + shift)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _FittedModel:
-    frame: Frame
-    log_odds: LogOdds
-    answers: int
-
-    def p_false(self, answers: Sequence[Prediction]) -> NDArray[np.float64]:
-        """Return the probability of a false fix, shape (N,)."""
-        chance = special.expit(self.log_odds(self.frame.filled(features(answers))))
-        return np.asarray((self.answers * chance + 1.0) / (self.answers + 2.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,11 +275,19 @@ class Counted:
         return np.array([upper_rate(min(self.false, below), below) for below in passed.tolist()])
 
 
-def _logistic(rows: Rows, is_false: NDArray[np.bool_]) -> LogisticRegression:
-    return LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000).fit(rows, is_false)
+# scikit-learn is loaded where something is fitted: it takes most of a second, and 90 MB.
 
 
-def _trees(rows: Rows, is_false: NDArray[np.bool_]) -> GradientBoostingClassifier:
+def _logistic(rows: Rows, is_false: NDArray[np.bool_]) -> Linear:
+    from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]  # noqa: PLC0415
+
+    found = LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000).fit(rows, is_false)
+    return Linear(weights=found.coef_[0], intercept=float(found.intercept_[0]))
+
+
+def _trees(rows: Rows, is_false: NDArray[np.bool_]) -> "GradientBoostingClassifier":
+    from sklearn.ensemble import GradientBoostingClassifier  # noqa: PLC0415
+
     # 500 answers of one tree at most: more cost time and gain nothing at this depth
     trees = GradientBoostingClassifier(
         n_estimators=60,

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.canvas import Page, page, without_ticks
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import GROUND, class_keys, north_arrow, scale_bar
+from sasgeo_bench.regions.preview import GROUND, HIDDEN, class_keys, north_arrow, paint_evidence, scale_bar
 from sasgeo_bench.regions.region import Manifest
-from sasgeo_bench.tasks.sheet import HIDDEN, paint
 
 UNIT: Final = "nats for 100 m\u00b2"
 _MOST_CELLS: Final = 900  # of a picture's side
@@ -102,7 +101,7 @@ def draw_weights(path: Path, sheet: WeightSheet) -> None:
         keys=keys,
     )
     with page(path, about) as ((seen, weighed),):
-        picture_of(seen, paint(place), side_m, "what is mapped")
+        picture_of(seen, paint_evidence(place), side_m, "what is mapped")
         scale_bar(seen, *side_m)
         north_arrow(seen, *side_m)
         mapped = picture_of(weighed, np.where(weights < 0, np.nan, weights), side_m, "what it weighs: w", top=sheet.top)

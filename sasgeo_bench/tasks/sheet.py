@@ -28,7 +28,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.layers import read_layers, read_overview
-from sasgeo_bench.regions.preview import GROUND, PAINT_ORDER, paint_overview
+from sasgeo_bench.regions.preview import GROUND, HIDDEN, paint_evidence, paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
 from sasgeo_bench.tasks.build import rebuild_hint
 from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, TWIN_TURN, PriorGroup, Query, Truth, flight_id
@@ -38,7 +38,6 @@ from sasgeo_bench.tasks.suites.mining import describe, mine
 from sasgeo_bench.tasks.suites.rivals import IN_DISC, LEAD, LISTED, RIVALS, TRUTH_LISTED
 from sasgeo_bench.tasks.task_files import QUERIES, Task, read_batches
 
-HIDDEN: Final = "#9e9e9e"
 ONLY_SEEN: Final = "#c2185b"
 ONLY_MAPPED: Final = "#1565c0"
 AGREE: Final = "#d9d9d9"
@@ -63,18 +62,6 @@ class Panel:
     at_truth: Evidence | None
     at_decoy: Evidence | None
     rival: str = DECOY
-
-
-def paint(evidence: Evidence) -> NDArray[np.float64]:
-    """Return colours of a view, shape (rows, cols, 3), 0..1; grey in proportion to the unknown classes."""
-    picture = np.empty((*evidence.shape, 3))
-    picture[:] = to_rgb(GROUND)
-    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
-    for name in PAINT_ORDER:
-        if name in evidence.classes:
-            picture[evidence.layer(name) == PRESENT] = colours[name]
-    unknown = (evidence.cells == UNKNOWN).mean(axis=0)[..., None]
-    return np.asarray(picture * (1 - unknown) + np.array(to_rgb(HIDDEN)) * unknown)
 
 
 def paint_difference(seen: Evidence, mapped: Evidence) -> NDArray[np.float64]:
@@ -156,10 +143,10 @@ def _photo(query: Query) -> NDArray[np.float64] | None:
 def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:
     seen, mapped, decoy = panel.query.evidence, panel.at_truth, panel.at_decoy
     return (
-        paint(seen),
-        None if mapped is None else paint(mapped),
+        paint_evidence(seen),
+        None if mapped is None else paint_evidence(mapped),
         None if mapped is None else paint_difference(seen, mapped),
-        None if decoy is None else paint(decoy),
+        None if decoy is None else paint_evidence(decoy),
     )
 
 

@@ -826,7 +826,9 @@ def read_task(folder: str | Path) -> dict[str, JsonValue]:
 def _read_manifest(folder: Path, *, named: str | Path) -> TaskManifest:
     path = folder / TASK
     if not path.is_file():
-        raise StoreError(f"{named} holds no {TASK}: make the queries first")
+        inside = next(iter(sorted(folder.glob(f"*/{TASK}"))), None)
+        mend = "make the queries first" if inside is None else f"name a task in it, as {inside.parent}, or all by a *"
+        raise StoreError(f"{named} holds no {TASK}: {mend}")
     content = read_json(path, mend=_MEND)
     about = content if isinstance(content, dict) else {}
     for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):

@@ -119,6 +119,8 @@ def test_the_card_of_one_is_shown_field_by_field(kind, name, expected, program) 
     [
         (["list-matchers", "random"], ["list", "matchers", "random"]),
         (["check-tracker", "x"], ["check", "--kind", "tracker", "x"]),
+        (["propose-regions", "no.toml", "--jobs", "2"], ["new-region", "--manifest", "no.toml", "--jobs", "2"]),
+        (["locate-dataset", "--kind", "dense-uav", "x"], ["import-dataset", "--where", "--kind", "dense-uav", "x"]),
     ],
 )
 def test_the_names_of_before_still_work(old, new, program) -> None:
@@ -309,6 +311,7 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
         ),
         (("--most-trained", "0"), "--most-trained must lie between 1 and 2000, got 0"),
         (("--tasks", "nowhere"), "nowhere holds no task.json: make the queries first"),
+        (("--tasks", str(Path(TASK).parent)), f"holds no task.json: name a task in it, as {TASK}, or all by a *"),
         (("--out", "a-file"), "cannot be written (Not a directory)"),
     ],
 )

@@ -30,6 +30,7 @@ from sasgeo_bench.observing.fixes import COLUMNS, Fix, LocateRequest, verdict
 from sasgeo_bench.observing.locate import answer_key, locate, map_of
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import csv_text, geojson_text, gpx_text, kml_text, page_text, tum_text
+from sasgeo_bench.regions.packed_map import pack_map
 from sasgeo_bench.sensing.crops import drawn_crops
 
 TOWN = "town-riverside"
@@ -144,6 +145,16 @@ def test_a_second_call_asks_nothing_anew_and_tries_what_failed(located, towns, p
 
 
 @pytest.mark.slow
+def test_a_packed_map_gives_the_same_fixes(located, towns, pictures, tmp_path):
+    pack_map(towns / "regions" / TOWN, tmp_path / "town.map")
+    width, region = SIDE_PX * PIXEL_M, str(tmp_path / "town.map")
+    words = {"ground_width": width, "region": region, "most_false": 0.1, "trusted": True}
+    found = sgb.locate(pictures, out=tmp_path / "out", into=tmp_path / "into", **words)
+    assert [replace(fix, seconds=0.0) for fix in found.fixes] == [replace(fix, seconds=0.0) for fix in located[1].fixes]
+    assert (tmp_path / "into" / "index.html").is_file()
+
+
+@pytest.mark.slow
 def test_a_picture_that_is_added_or_changed_gets_an_answer_and_a_strip_of_its_own(towns, pictures, tmp_path):
     folder = tmp_path / "own"
     folder.mkdir()
@@ -253,8 +264,11 @@ def test_stored_answers_order_right_before_false():
     false = answers.is_false
     assert p_false[false].mean() > 0.7
     assert p_false[~false].mean() < 0.3
+    # the fit that is stored is that of these answers
+    again = Chances.fitted(answers)
+    np.testing.assert_allclose(again.rejector.p_false(answers.predictions()), p_false, rtol=1e-6, atol=1e-9)
     # a place that is left out changes the fit
-    without = Chances.of(answers, without=[answers.places[0]])
+    without = Chances.fitted(answers, without=[answers.places[0]])
     assert without.p_false(answers.predictions()[0]) != chances.p_false(answers.predictions()[0])
     assert answers_for("sasgeo", "0", "osm_unet") is None
     assert answers_for("sasgeo", answers.version, "colour_thresholds") is None

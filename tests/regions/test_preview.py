@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 import shapely
 from matplotlib import image
+from matplotlib.colors import to_rgb
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import preview
 from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
-from sasgeo_bench.regions.preview import write_preview
+from sasgeo_bench.regions.preview import GROUND, HIDDEN, paint_evidence, write_preview
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 
 
@@ -83,3 +85,11 @@ def test_the_edge_of_what_is_mapped_is_drawn_and_nothing_covers_the_map(tmp_path
     edge = np.abs(parted - whole).max(axis=2)[inside] > 60
     assert edge.any(axis=1).all()
     assert 1 <= edge.any(axis=0).sum() <= 5
+
+
+def test_a_view_is_painted_in_the_colours_of_its_classes():
+    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
+    cells = np.array([[[1, 0, UNKNOWN]], [[0, 0, UNKNOWN]]], dtype=np.uint8)
+    picture = paint_evidence(Evidence(classes=("road_major", "building"), cells=cells, cell_size_m=1.0))
+    assert picture.shape == (1, 3, 3)
+    np.testing.assert_allclose(picture[0], [colours["road_major"], to_rgb(GROUND), to_rgb(HIDDEN)])

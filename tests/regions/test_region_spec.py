@@ -7,7 +7,7 @@ import pytest
 
 from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError
-from sasgeo_bench.regions.region_spec import RegionFile
+from sasgeo_bench.regions.region_spec import OWN_FOLDER, RegionFile, find_region_file
 
 EXTRACT = f'[[extract]]\nfile = "a.osm.pbf"\ndate = 2020-01-01\nsha256 = ["{"0" * 64}"]\n'
 
@@ -88,3 +88,19 @@ def test_the_newest_extract_is_picked_and_any_by_its_date():
     assert region.pick(dt.date(2020, 1, 1)).date == dt.date(2020, 1, 1)
     with pytest.raises(ConfigError, match="2020-01-01, 2022-01-01"):
         region.pick(dt.date(2021, 1, 1))
+
+
+def test_a_region_that_new_region_wrote_is_found_by_its_name_after_those_of_the_folders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"there is no region 'my-town' \(list regions shows all\)"):
+        find_region_file("my-town")
+    own = OWN_FOLDER / "my-town.toml"
+    own.parent.mkdir()
+    own.write_text(text().replace('"mine"', '"my-town"'), encoding="utf-8")
+    assert find_region_file("my-town") == own
+    other = tmp_path / "others" / "my-town.toml"
+    other.parent.mkdir()
+    other.write_text(own.read_text(encoding="utf-8"), encoding="utf-8")
+    assert find_region_file("my-town", folders=[other.parent]) == other
+    (OWN_FOLDER / "vaduz.toml").write_text(text().replace('"mine"', '"vaduz"'), encoding="utf-8")
+    assert find_region_file("vaduz") != OWN_FOLDER / "vaduz.toml"

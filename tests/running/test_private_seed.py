@@ -77,6 +77,18 @@ def test_the_file_of_a_pipelines_seed_is_hidden_wherever_it_lies(tmp_path):
     assert {request.out.resolve() / name for name in others} <= set(reach_of(request, ()).hidden)
 
 
+def test_a_map_behind_a_link_is_readable_and_the_others_there_are_hidden(tmp_path):
+    disk, out = tmp_path / "disk", tmp_path / "out"
+    for name in ("here", "here@2020-01-01"):
+        (disk / name).mkdir(parents=True)
+    out.mkdir()
+    (out / "regions").symlink_to(disk)
+    reach = reach_of(RunRequest(spec="random", tasks=[], out=out), [out / "regions" / "here"])
+    assert reach.readable == [disk / "here"]
+    assert disk / "here@2020-01-01" in reach.hidden
+    assert not any((disk / "here").is_relative_to(path.resolve()) for path in reach.hidden)
+
+
 def test_a_matcher_that_bears_a_shipped_name_is_refused_before_it_is_asked_or_tried(made, monkeypatch):
     monkeypatch.chdir(made)
     monkeypatch.syspath_prepend(str(made))

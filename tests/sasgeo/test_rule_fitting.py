@@ -6,7 +6,7 @@ import pytest
 
 from sasgeo_bench.sasgeo.graph import START, Matching
 from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS
-from sasgeo_bench.sasgeo.rejectors import fit_rules
+from sasgeo_bench.sasgeo.rule_fitting import fit_rules
 
 MANY = 20_000
 

@@ -16,20 +16,17 @@ from matplotlib.colors import to_rgb
 
 from sasgeo_bench.core.canvas import DPI
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.preview import GROUND, HIDDEN
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.sheet import (
     AGREE,
     DECOY,
-    GROUND,
-    HIDDEN,
     ONLY_MAPPED,
     ONLY_SEEN,
     TWIN,
     Panel,
-    paint,
     paint_difference,
     sheet_figure,
     write_sheet,
@@ -83,13 +80,6 @@ def panel(*, has_map=True, has_vectors=False, **changes):
     }
     mapped = seen if has_map else None
     return Panel(query=query, truth=Truth(**truth | changes), at_truth=mapped, at_decoy=mapped)
-
-
-def test_a_view_is_painted_in_the_colours_of_its_classes():
-    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
-    picture = paint(sight([[[1, 0, 2]], [[0, 0, 2]]]))
-    assert picture.shape == (1, 3, 3)
-    np.testing.assert_allclose(picture[0], [colours["road_major"], to_rgb(GROUND), to_rgb(HIDDEN)])
 
 
 @given(cells, cells)

@@ -96,8 +96,11 @@ class OsmUNet:
         is_known = has_data(small, pixel_m)
         exposure = self._exposure or Exposure.of(small[is_known] if is_known.any() else small.reshape(-1, 3))
         odds = _log_odds(_network(self._weights), normalized(small, exposure), is_mirrored=self._is_mirrored)
-        found = np.stack([enlarged(expit(plane), image.shape) for plane in odds])
-        found[:, ~enlarged_mask(is_known, image.shape)] = np.nan
+        found = np.empty((len(odds), *image.shape), dtype=np.float32)
+        is_silent = ~enlarged_mask(is_known, image.shape)
+        for plane, of_class in zip(found, odds, strict=True):
+            plane[:] = enlarged(expit(of_class), image.shape)
+            plane[is_silent] = np.nan
         return sgb.Segmentation.of_probabilities(CLASSES, found)
 
 

@@ -88,7 +88,7 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
 
 def read_places(path: Path) -> Floats:
     """Return longitude and latitude of the points of a log, shape (N, 2); what else it holds needs no unit."""
-    is_table = path.suffix.lower() in (".csv", ".pos")
+    is_table = path.suffix.lower() in _TABLES
     facts = LogFacts(time_unit="none", height_unit="none", angle_unit="none") if is_table else None
     log = read_log(path, facts)
     return np.column_stack([log.lon_deg, log.lat_deg])
@@ -229,13 +229,14 @@ class FlownPath:
     least_m: float = SHORTEST_FLOWN_M
 
     def __post_init__(self) -> None:
-        if not self.file.is_file():
+        if not self.file.is_file() and not is_bag(self.file):
             raise FlightError(f"there is no flight log {self.file}: check the path")
 
     @cached_property
     def key(self) -> str:
         """Return the hash of all that the path follows from."""
-        files = [sha256_of(self.file), None if self.facts.dem is None else sha256_of(self.facts.dem)]
+        logs = sorted(self.file.iterdir()) if self.file.is_dir() else [self.file]
+        files = [*map(sha256_of, logs), None if self.facts.dem is None else sha256_of(self.facts.dem)]
         asked = [*files, self.file.name, asdict(self.facts) | {"dem": None}, self.height_m, self.least_m]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 

@@ -59,10 +59,11 @@ _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
 def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | None = None) -> FlightLog:
-    """Read a log by its suffix, one of `SUFFIXES`, or the folder of a bag; raise `FlightError` if it is not sound.
+    """Read a log by its suffix (GPX, KML, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
 
     `facts` say what a table does not; what they say of a file without it is refused. A line drawn in KML has no times:
-    `read_flight` flies it at an even speed. A `height_m` replaces the log's heights.
+    `read_flight` flies it at an even speed. A `height_m` replaces the log's heights. Logs of autopilots are read by their
+    suffixes, too (`SUFFIXES`), and so are folders of bags of ROS 2.
 
     >>> import tempfile
     >>> line = "<coordinates>9.52,47.14,80 9.53,47.15,80</coordinates><altitudeMode>relativeToGround</altitudeMode>"
@@ -148,8 +149,8 @@ def read_flight(
     Parameters
     ----------
     path : Path
-        Of one of `SUFFIXES`, or the folder of a bag. Positions of TUM (.tum, .txt) are easting, northing and height of
-        the region's CRS.
+        GPX, KML, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting, northing and height
+        of the region's CRS.
     region : Region
         The stretch lies over its mapped ground.
     margin_m : float

@@ -62,8 +62,8 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
     """Read a log by its suffix (GPX, KML, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
 
     `facts` say what a table does not; what they say of a file without it is refused. A line drawn in KML has no times:
-    `read_flight` flies it at an even speed. A `height_m` replaces the log's heights. Logs of autopilots are read by their
-    suffixes, too (`SUFFIXES`), and so are folders of bags of ROS 2.
+    `read_flight` flies it at an even speed. A `height_m` replaces the log's heights. Logs of autopilots are read by
+    their suffixes, too (`SUFFIXES`), and so are folders of bags of ROS 2.
 
     >>> import tempfile
     >>> line = "<coordinates>9.52,47.14,80 9.53,47.15,80</coordinates><altitudeMode>relativeToGround</altitudeMode>"

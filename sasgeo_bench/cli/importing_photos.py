@@ -22,6 +22,7 @@ from sasgeo_bench.observing.masks import read_legend
 from sasgeo_bench.observing.photo_flights import OdometerName
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights
+from sasgeo_bench.observing.video import is_video
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.task_files import Task
 
@@ -115,7 +116,12 @@ def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
     sasgeo_bench.core.errors.ConfigError: heights come from one source: give --height, --dem or --takeoff-height alone
     """
     request = replace(_request(options, options.pictures), odometry=options.odometry)
-    tasks = imported_by(replace(request, pictures=options.photos_of(options.pictures, options.out)))
+    if options.track is not None and not is_video(options.pictures):
+        options.check_of_video("every", "fov")
+        request = replace(request, log=options.track, offset_s=options.offset)
+    else:
+        request = replace(request, pictures=options.photos_of(options.pictures, options.out))
+    tasks = imported_by(request)
     for task in tasks:
         options.say(task.folder)
     return tasks

@@ -45,12 +45,16 @@ class VideoOptions(Options):
         typer.Option(help="seconds of the track at which a video begins; default: by the motion that both show"),
     ] = None
 
+    def check_of_video(self, *names: str) -> None:
+        """Raise `ConfigError` if options are given that only a video has."""
+        for name in names:
+            if getattr(self, name) is not None:
+                raise ConfigError(f"--{name} is of a video, and these pictures are none: leave it out")
+
     def photos_of(self, pictures: Path, out: Path, *, needs_track: bool = True, needs_lens: bool = True) -> Path:
         """Return the folder of a video's frames, which are written if they are not there; anything else as it is."""
         if not is_video(pictures):
-            for name in ("track", "every", "fov", "offset"):
-                if getattr(self, name) is not None:
-                    raise ConfigError(f"--{name} is of a video, and {pictures} is none: leave it out")
+            self.check_of_video("track", "every", "fov", "offset")
             return pictures
         request = VideoRequest(
             path=pictures,

@@ -9,7 +9,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -25,12 +24,9 @@ from sasgeo_bench.core.folders import fresh_folder, locked, sha256_of
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import message_of, plain
-from sasgeo_bench.flights.log_points import FlightLog
-from sasgeo_bench.flights.log_subtitles import read_srt
 from sasgeo_bench.flights.log_units import LOWEST_M
-from sasgeo_bench.flights.logs import MOST_GAP_S, is_tum, read_log
 from sasgeo_bench.observing.pictures import STEEPEST_DEG
-from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M
+from sasgeo_bench.observing.tracks import Moment, Track, read_track
 from sasgeo_bench.observing.video_motion import NEAR_S, STEP_S, Begin, Headings, MotionSeen, find_begin, find_headings
 from sasgeo_bench.sensing.camera import Attitude
 from sasgeo_bench.sensing.photos import Lens
@@ -44,10 +40,7 @@ FRAMES: Final = "frames"  # folder below the root of outputs
 _RECORD: Final = "frames.json"
 _VERSION: Final = 1  # raised when the same video gives other photos
 _QUALITY: Final = 92  # of JPEGs
-_ENDS_S: Final = 1.0  # before the first and after the last point of a track whose place is still that of a point
 _SAMPLE: Final = 2**20  # bytes of each end of a video that tell it from others
-_DEGREE_M: Final = 111_195.0  # of latitude
-_DIGITS: Final = 7  # behind the point of a degree that are as good as any
 _XMP: Final = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
 <rdf:Description rdf:about="" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {}/></rdf:RDF></x:xmpmeta>"""
 
@@ -130,7 +123,7 @@ def video_photos(request: VideoRequest) -> Path:
     found = request.track or _beside(request.path)
     if found is None and request.needs_track:
         raise FlightError(_no_track(video))
-    track = None if found is None else _read_track(found)
+    track = None if found is None else read_track(found)
     if track is not None and request.offset_s is not None and not track.has_own_clock:
         raise ConfigError(f"{plain(track.path.name)} counts from the video's begin: leave out --offset")
     if request.fov_deg is None and request.needs_lens and (track is None or track.film_mm is None):
@@ -208,112 +201,13 @@ def _kept(folder: Path, key: str) -> list[str] | None:
     return [str(line) for line in lines] if isinstance(lines, list) and lines else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Moment:
-    """What a track says of one time; None for what it does not."""
-
-    lonlat: tuple[float, float]
-    height_m: float | None = None
-    altitude_m: float | None = None
-    camera: Attitude | None = None
-    film_mm: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Track:
-    """Where the camera was, by the clock of the video, or by one of its own."""
-
-    path: Path
-    log: FlightLog
-    time_s: Floats
-    has_own_clock: bool
-    camera_deg: Floats | None = None  # yaw, pitch, roll
-    film_mm: Floats | None = None
-    began: dt.datetime | None = None  # by the drone's clock
-    notes: tuple[str, ...] = ()
-
-    @cached_property
-    def sigma_m(self) -> float | None:
-        """Return the standard deviation of places that are rounded to metres; None where they are not."""
-        for digits in range(2, _DIGITS):
-            if all(np.array_equal(np.round(one, digits), one) for one in (self.log.lon_deg, self.log.lat_deg)):
-                rounded_m = 10.0**-digits * _DEGREE_M / math.sqrt(12)
-                return None if rounded_m < 0.1 * GPS_SIGMA_M else round(math.hypot(GPS_SIGMA_M, rounded_m), 2)
-        return None
-
-    def at(self, time_s: float) -> _Moment | str:
-        """Return what the track says of a time of its clock, or why it says nothing."""
-        times = self.time_s
-        if not times[0] - _ENDS_S <= time_s <= times[-1] + _ENDS_S:
-            return "that the track does not cover"
-        after = int(np.clip(np.searchsorted(times, time_s), 1, len(times) - 1))
-        if self.has_own_clock and times[after] - times[after - 1] > MOST_GAP_S:  # an SRT repeats what has not changed
-            return f"in a gap of more than {MOST_GAP_S:g} s of the track"
-
-        def linear(values: Floats | None, period: float | None = None) -> float | None:
-            if values is None:
-                return None
-            pair = slice(after - 1, after + 1)
-            two = np.unwrap(values[pair], period=period) if period else values[pair]
-            return float(np.interp(time_s, times[pair], two))
-
-        angles = [linear(column, 360.0) for column in self.camera_deg.T] if self.camera_deg is not None else [None]
-        lon, lat = linear(self.log.lon_deg, 360.0), linear(self.log.lat_deg)
-        assert lon is not None and lat is not None  # noqa: S101, PT018 - of every log
-        return _Moment(
-            lonlat=((lon + 180.0) % 360.0 - 180.0, lat),
-            height_m=linear(self.log.height_m),
-            altitude_m=linear(self.log.altitude_m),
-            camera=None
-            if None in angles
-            else Attitude(yaw_deg=angles[0] or 0.0, pitch_deg=angles[1] or 0.0, roll_deg=angles[2] or 0.0),
-            film_mm=linear(self.film_mm),
-        )
-
-
-def _read_track(path: Path) -> _Track:
-    if is_tum(path):
-        raise FlightError(f"{plain(path.name)} has no longitude and latitude: name a track that has")
-    if path.suffix.lower() == ".srt":
-        said = read_srt(path)
-        log, angles, film_mm, began = said.log, said.gimbal_deg, said.film_mm, said.began
-    else:
-        log, angles, film_mm, began = _read_log(path), None, None, None
-    if log.time_s is None:
-        raise FlightError(f"{plain(path.name)} has no times: name a track that has")
-    notes = list(log.notes)
-    if angles is None and log.yaw_deg is not None:
-        # The gimbal follows the body's yaw, unless it is turned by hand.
-        angles = np.column_stack([log.yaw_deg, np.full(len(log), -90.0), np.zeros(len(log))])
-        notes.append("no angles of the camera: taken as looking straight down, its up as the drone heads")
-    return _Track(
-        path=path,
-        log=log,
-        time_s=log.time_s,
-        has_own_clock=path.suffix.lower() != ".srt",
-        camera_deg=angles,
-        film_mm=film_mm,
-        began=began,
-        notes=tuple(notes),
-    )
-
-
-def _read_log(path: Path) -> FlightLog:
-    try:
-        return read_log(path)
-    except FlightError as error:
-        if "-unit" in str(error):
-            raise FlightError(f"{error}; the latter, since units of a video's track are said by its names") from error
-        raise
-
-
 @dataclass(kw_only=True)
 class _Cutter:
     """Cuts one video into photos."""
 
     request: VideoRequest
     video: Video
-    track: _Track | None
+    track: Track | None
     headings: Headings | None = None
     lines: list[str] = field(default_factory=list)
     left_out: "Counter[str]" = field(default_factory=Counter)
@@ -381,7 +275,7 @@ class _Cutter:
             self.left_out[moment] += 1
         return not isinstance(moment, str)
 
-    def _moment(self, time_s: float, begin: Begin) -> _Moment | str | None:
+    def _moment(self, time_s: float, begin: Begin) -> Moment | str | None:
         """Return what the track says of a frame; why it is left out; or None without a track."""
         if self.track is None:
             return None
@@ -447,7 +341,7 @@ class _Cutter:
         path.write_bytes(jpeg[:2] + b"".join(parts) + jpeg[2:])
         return True
 
-    def _metadata(self, moment: _Moment | None, time_s: float, begin: Begin) -> tuple[Image.Exif, str]:
+    def _metadata(self, moment: Moment | None, time_s: float, begin: Begin) -> tuple[Image.Exif, str]:
         exif = Image.Exif()
         exif[ExifTags.Base.Software] = "sasgeo-bench"
         inner, gps = exif.get_ifd(ExifTags.IFD.Exif), exif.get_ifd(ExifTags.IFD.GPSInfo)
@@ -520,7 +414,7 @@ def _utc(time_s: float) -> dt.datetime:
     return dt.datetime.fromtimestamp(time_s, tz=dt.UTC)
 
 
-def _place(moment: _Moment, sigma_m: float | None) -> Mapping[int, object]:
+def _place(moment: Moment, sigma_m: float | None) -> Mapping[int, object]:
     found: dict[int, object] = {ExifTags.GPS.GPSMapDatum: "WGS-84"}
     for value, tag, ends in zip(
         moment.lonlat, (ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLatitude), ("EW", "NS"), strict=True

@@ -454,6 +454,7 @@ class Photo:
     flight: Attitude | None = None
     lens: Lens = Lens()
     taken_at: dt.datetime | None = None
+    utc_offset: dt.timedelta | None = None
     model: str = ""
 
     def intrinsics(self) -> Intrinsics:
@@ -583,6 +584,7 @@ def photo_of(name: str, head: PhotoHead, *, most_pixels: int = 200_000_000) -> P
         flight=body_angles(head.xmp),
         lens=_lens(head.inner, head.xmp, make),
         taken_at=_time(head.inner),
+        utc_offset=_utc_offset(head.inner),
         model=_text(head.exif.get(ExifTags.Base.Model)),
     )
 
@@ -648,6 +650,16 @@ def _degrees(parts: object, side: object, plus: str, minus: str) -> float | None
         return None
     degrees = float(np.dot(np.array(numbers, dtype=np.float64), (1, 1 / 60, 1 / 3600)))
     return degrees if side == plus else -degrees
+
+
+def _utc_offset(inner: Mapping[int, Any]) -> dt.timedelta | None:
+    """Return how far the clock is ahead of UTC (EXIF 2.31, OffsetTimeOriginal); None where the file does not say."""
+    text = _text(inner.get(ExifTags.Base.OffsetTimeOriginal))
+    found = re.fullmatch(r"([+-])([0-9]{2}):([0-9]{2})", text.strip())
+    if found is None:
+        return None
+    offset = dt.timedelta(hours=int(found[2]), minutes=int(found[3]))
+    return -offset if found[1] == "-" else offset
 
 
 def _time(inner: Mapping[int, Any]) -> dt.datetime | None:

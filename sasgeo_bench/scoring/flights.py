@@ -34,6 +34,12 @@ DIVERGED_M: Final = 100.0
 _DIVERGED_FOR_M: Final = 500.0
 SHARE_INSIDE: Final = 0.95  # of true places, that an honest ellipse of that share holds
 _INSIDE: Final = float(chi2.ppf(SHARE_INSIDE, 2))  # squared distance to the rim of that ellipse
+# Of an honest covariance NEES lies in this band in 95 % of flights if all views of one share their error, and in more
+# if they do not: chi-square with the 3 degrees of freedom of one view (Bar-Shalom et al. 2001, section 5.4.2).
+NEES_BAND: Final = tuple(float(chi2.ppf(tail, SIDE)) / SIDE for tail in (0.025, 0.975))
+FRESH_S: Final = 30.0  # age up to which a fix is of use: some 300 m flown, of which a fair odometer loses 1 %
+HOLDS_S: Final = 60.0  # window of continuity; ICAO's of an approach is 15 s, of a flight en route an hour
+_AGE_SHARE: Final = 0.95
 _NEEDED: Final = frozenset({"distance_m", "time_s"})  # measured at each view
 _JUMP_M: Final = 1.0  # more between two views than was flown: the drone was carried
 
@@ -77,6 +83,21 @@ class FlightScore:
         "The same distance from the first view after being carried, or else after the longest gap or stretch off the "
         "map, of two views at least; NaN where the flight has none, or ends in it",
     ]
+    duration_s: Annotated[float, "Time from the first view to the last"]
+    fix_age_p95_s: Annotated[
+        float,
+        "Age of the last accepted fix, right or not, that is not exceeded in 95 % of that time; until the first fix it "
+        "counts from the start",
+    ]
+    fix_age_longest_s: Annotated[float, "The longest such age"]
+    fix_age_p95_m: Annotated[float, "The same as fix_age_p95_s in metres flown since, of the way"]
+    fix_age_longest_m: Annotated[float, "The most metres flown since"]
+    available_30s: Annotated[float, "Share of the time with an accepted fix that is 30 s old at most"]
+    continuity_60s: Annotated[
+        float,
+        "Of the moments with such a fix, 60 s or more before the end, the share from which on there is one all 60 s "
+        "long; 0 without such a moment, NaN of a shorter flight",
+    ]
     divergences: Annotated[int, "Number of stretches of more than 500 m with accepted fixes all beyond 100 m"]
     ate_m: Annotated[
         float,
@@ -91,6 +112,9 @@ class FlightScore:
         "an inverse",
     ]
     nees_off: Annotated[float, "Its absolute logarithm: 0 for an honest covariance"]
+    nees_in_band: Annotated[
+        bool, f"It lies in chi-square's band of 95 % for one view, {NEES_BAND[0]:.2f} to {NEES_BAND[1]:.2f}"
+    ]
     inside_95: Annotated[
         float,
         "Share of the views with an estimate whose true position lies in its ellipse of 95 %; without one it does not",
@@ -278,6 +302,7 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
     event = _event(column["is_seen"] & column["is_present"], column["is_carried"])
     reckoned, answered = _Reckoned.of(views, increments), column["is_answered"].astype(bool)
     nees = float(column["nees"][answered].mean()) if answered.any() else math.inf
+    time_s = column["time_s"].astype(float)
     return FlightScore(
         views=len(views),
         length_m=length_m,
@@ -291,14 +316,22 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
         false_per_km=float(false.sum()) * per_km,
         longest_without_fix_m=_longest(distance_m, right),
         first_fix_m=first_fix_m,
-        first_fix_s=_first(column["time_s"].astype(float), right),
+        first_fix_s=_first(time_s, right),
         reacquired_m=math.nan if event is None else _first(distance_m[event:] - distance_m[event], right[event:]),
+        duration_s=float(time_s[-1] - time_s[0]),
+        fix_age_p95_s=age_quantile(time_s, accepted),
+        fix_age_longest_s=_longest(time_s, accepted),
+        fix_age_p95_m=age_quantile(distance_m, accepted),
+        fix_age_longest_m=_longest(distance_m, accepted),
+        available_30s=availability(time_s, accepted, FRESH_S),
+        continuity_60s=continuity(time_s, accepted, FRESH_S, HOLDS_S),
         divergences=_divergences(distance_m, accepted & (error_m > DIVERGED_M), accepted),
         ate_m=float(np.sqrt(np.mean(error_m**2))),
         error_p50_m=_quantile(error_m, 0.5),
         error_p95_m=_quantile(error_m, 0.95),
         nees=nees,
         nees_off=abs(math.log(nees)) if 0 < nees < math.inf else math.inf,
+        nees_in_band=NEES_BAND[0] <= nees <= NEES_BAND[1],
         inside_95=float(column["is_inside"][answered].mean()) if answered.any() else 0.0,
         odometer_drift=reckoned.drift(),
     )
@@ -341,6 +374,77 @@ def _longest(distance_m: Floats, is_fix: Bools) -> float:
     """
     known = np.concatenate([distance_m[:1], distance_m[is_fix], distance_m[-1:]])
     return float(np.diff(known).max())
+
+
+def age_quantile(at: Floats, is_fix: Bools, share: float = _AGE_SHARE) -> float:
+    """Return the age of the last fix that is not exceeded during a share of the way or time, in its unit.
+
+    `at`, shape (N,), are places or moments of views in ascending order; until the first fix the age counts from the
+    start. Between views it grows, so that of a gap of length g a part of g - a is older than a; the gaps together hold
+    1 - share of the whole at the age sought, which is the most that the longest k gaps ask for, over all k.
+
+    Gaps of 10 and 30 s: of 40 s the last 2 s of the longer one are older than 28 s.
+
+    >>> round(age_quantile(np.array([0.0, 10.0, 20.0, 40.0]), np.array([True, True, False, False])), 6)
+    28.0
+    """
+    known = np.concatenate([at[:1], at[is_fix], at[-1:]])
+    gaps = np.sort(np.diff(known))[::-1]
+    rest = (1.0 - share) * (at[-1] - at[0])
+    return float(max(0.0, ((np.cumsum(gaps) - rest) / np.arange(1, len(gaps) + 1)).max()))
+
+
+def availability(time_s: Floats, is_fix: Bools, age_s: float) -> float:
+    """Return the share of the time with a fix that is `age_s` old at most; there is none before the first.
+
+    >>> availability(np.array([0.0, 10.0, 60.0, 100.0]), np.array([False, True, True, False]), 30.0)
+    0.6
+    """
+    known = np.append(time_s[is_fix], time_s[-1])
+    whole_s = float(time_s[-1] - time_s[0])
+    return float(np.minimum(np.diff(known), age_s).sum() / whole_s) if whole_s > 0 else float(is_fix.any())
+
+
+def continuity(time_s: Floats, is_fix: Bools, age_s: float, holds_s: float) -> float:
+    """Return the chance that a fix of `age_s` at most is there for `holds_s` more, given that there is one.
+
+    It is over all moments with such a fix that lie `holds_s` or more before the end; 0 without any, NaN if the flight
+    is shorter.
+
+    ICAO Annex 10, volume I, attachment D: the probability that a service that is there at the beginning
+    of an operation is there until its end.
+
+    There is a fix for 30 s, of which the first 10 s have it 20 s later:
+
+    >>> continuity(np.array([0.0, 100.0]), np.array([True, False]), 30.0, 20.0)
+    0.3333333333333333
+    """
+    last_s = float(time_s[-1]) - holds_s
+    if not last_s > time_s[0]:
+        return math.nan
+    fixes_s = time_s[is_fix]
+    if not len(fixes_s):
+        return 0.0
+    is_parted = np.diff(fixes_s) > age_s
+    since_s = fixes_s[np.append(np.array([True]), is_parted)]
+    ends = np.append(is_parted, fixes_s[-1] + age_s < time_s[-1])
+    until_s = np.append(fixes_s[ends] + age_s, np.inf)[: len(since_s)]  # what is there at the end does not end
+    whole_s = np.maximum(np.minimum(until_s, last_s) - since_s, 0.0).sum()
+    held_s = np.maximum(np.minimum(until_s - holds_s, last_s) - since_s, 0.0).sum()
+    return float(held_s / whole_s) if whole_s > 0 else 0.0
+
+
+def share_within(views: pd.DataFrame, within_m: float, within_deg: float) -> dict[str, float]:
+    """Return by flight the share of its way with an estimate within metres and degrees, accepted or not.
+
+    `views` are rows of `view_frame`; an error equal to a limit is within it.
+    """
+    is_near = (views["error_m"] <= within_m) & (views["yaw_error_deg"] <= within_deg)
+    names, distance_m = views["sequence_id"].tolist(), views["distance_m"].to_numpy(float)
+    return {
+        names[first]: _share(_ways_m(distance_m[first:last]), is_near.to_numpy(bool)[first:last])
+        for first, last in pairwise(_ends(names))
+    }
 
 
 def _event(is_sighted: Bools, is_carried: Bools) -> int | None:

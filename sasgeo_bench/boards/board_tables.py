@@ -893,7 +893,7 @@ def requirement_tables(requirements: pd.DataFrame) -> Iterator[Table]:
     `requirements.compliance_frame`.
     """
     parts = requirements.groupby(["suite", "track", "prior_group"], sort=True) if len(requirements) else ()
-    for (suite, track, prior_group), part in parts:
+    for at, ((suite, track, prior_group), part) in enumerate(parts):
         by_name: dict[str, dict[str, dict[str, Record]]] = {}
         for row in records_of(part):
             by_name.setdefault(row["matcher"], {}).setdefault(row["rejector"], {})[row["requirement"]] = row
@@ -916,7 +916,7 @@ def requirement_tables(requirements: pd.DataFrame) -> Iterator[Table]:
                 *(column("requirement", title=one) for one in asked),
             ),
             lines,
-            notes=_REQUIREMENT_NOTES,
+            notes=() if at else _REQUIREMENT_NOTES,
         ).without_empty("rejector")
 
 

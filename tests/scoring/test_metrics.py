@@ -8,7 +8,7 @@ import pytest
 
 from sasgeo_bench.scoring.decisions import Fixes, augrc, aurc, excess_aurc
 from sasgeo_bench.scoring.metric import MeanMetric
-from sasgeo_bench.scoring.metrics import METRICS, REJECTION, means_of, primary_of, quantiles_of
+from sasgeo_bench.scoring.metrics import METRICS, REJECTION, means_of, primary_of, quantiles_of, within_metric
 from sasgeo_bench.tasks.query import TRUTH_SIGMA
 from tests.scoring.test_tables import scores
 
@@ -37,6 +37,18 @@ def test_means_compute_what_they_are_named_after():
     assert found["within_25m"] == 0.75
     assert found["success_auc_50m"] == pytest.approx((0.98 + 0.86 + 0.6) / 4)
     assert all(isinstance(metric, MeanMetric) for metric in means_of("retrieval"))
+
+
+def test_places_and_headings_are_also_counted_by_themselves_and_an_answer_that_is_missing_is_beyond():
+    errors_deg = [180.0, 5.0, 0.0, 5.1, math.inf]
+    table = scores([5.0, 7.0, 20.0, 4.0, math.inf]).assign(yaw_error_deg=errors_deg)
+    found = {metric.name: metric.values(table).tolist() for metric in means_of("localization")}
+    assert found["within_5m"] == [1.0, 0.0, 0.0, 1.0, 0.0]
+    assert found["within_10m"] == [1.0, 1.0, 0.0, 1.0, 0.0]
+    assert found["within_5deg"] == [0.0, 1.0, 1.0, 0.0, 0.0]
+    assert found["within_25m"] == [1.0, 1.0, 1.0, 1.0, 0.0]
+    both = within_metric(10.0, 5.0)
+    assert (both.name, both.values(table).tolist()) == ("success_10m", found["success_10m"])
 
 
 def test_success_is_not_scored_within_less_than_two_deviations_of_the_truth():

@@ -52,7 +52,7 @@ from sasgeo_bench.scoring.contrasts import AREAS
 from sasgeo_bench.scoring.controls import Falsifier, Verdict
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES
 from sasgeo_bench.scoring.metric import MeanMetric
-from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, LOCALIZATION, WITHIN, primary_of
+from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, LOCALIZATION, RISKS, WITHIN, primary_of
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, mixture_name
 from sasgeo_bench.scoring.requirements import FAILS, NOT_SHOWN, PASSES, is_latency, own_metrics
 from sasgeo_bench.scoring.rows import ALL_SUITES, base_name, is_unranked
@@ -883,6 +883,7 @@ _REQUIREMENT_NOTES: Final = (
     "Figures are of the queries that the first figure counts.",
     "Those of accepted answers are of all queries of the suite, with thresholds that were chosen at other places.",
 )
+_RISK_REACHED: Final = frozenset(f"risk_reached_at_{risk:g}" for risk in RISKS)
 _TONE_OF: Final[Mapping[str, str]] = {PASSES: "passes", FAILS: "fails", NOT_SHOWN: "plain"}
 
 
@@ -928,7 +929,7 @@ def _requirement_cell(row: Record | None) -> Cell:
     if accepted == 0:
         details = ["nothing accepted"]
     elif math.isnan(value):
-        details = ["not measured"]
+        details = ["no threshold" if row["metric"] in _RISK_REACHED else "not measured"]
     else:
         details = [_amount_text(value, lo, hi, unit=str(row["unit"]))]
         details += ["in time"] if is_latency(str(row["metric"])) else []

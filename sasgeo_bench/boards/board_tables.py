@@ -887,7 +887,7 @@ _RISK_REACHED: Final = frozenset(f"risk_reached_at_{risk:g}" for risk in RISKS)
 _TONE_OF: Final[Mapping[str, str]] = {PASSES: "passes", FAILS: "fails", NOT_SHOWN: "plain"}
 
 
-def requirement_tables(requirements: pd.DataFrame) -> Iterator[Table]:
+def requirement_tables(requirements: pd.DataFrame, book: Book) -> Iterator[Table]:
     """Yield which entries pass the requirements, a table for each suite, track and prior group.
 
     A line is an entry, with each of its rejectors where a requirement is about accepted answers; `requirements` are of
@@ -906,7 +906,11 @@ def requirement_tables(requirements: pd.DataFrame) -> Iterator[Table]:
                 verdicts = {row["verdict"] for row in rows.values()}
                 whole = next((one for one in (FAILS, NOT_SHOWN) if one in verdicts), PASSES)
                 cells = (_requirement_cell(rows.get(one)) for one in asked)
-                lines.append((name, rejector or "-", Cell(text=whole, tone=_TONE_OF[whole]), *cells))
+                counts = sorted({int(row["n"]) for row in rows.values()} - {0}) or [0]
+                n = Cell(text="-".join(map(str, counts)), key=float(counts[0]))
+                lines.append(
+                    (book.short_name(name), rejector or "-", Cell(text=whole, tone=_TONE_OF[whole]), *cells, n)
+                )
         yield grid_of(
             file_stem("requirements", str(suite), str(track), str(prior_group)),
             f"Requirements: {suite}, {track}, {prior_words(str(prior_group))}",
@@ -915,6 +919,7 @@ def requirement_tables(requirements: pd.DataFrame) -> Iterator[Table]:
                 word("rejector"),
                 column("requirement", title="all"),
                 *(column("requirement", title=one) for one in asked),
+                column("n"),
             ),
             lines,
             notes=() if at else _REQUIREMENT_NOTES,

@@ -283,7 +283,7 @@ TABLES: Final = (  # of a whole board, in the order in which any outlet shows th
     TableKind(
         "requirements",
         "terminal leaderboard.md leaderboard.tex index.html",
-        lambda of: requirement_tables(of.requirements),
+        lambda of: requirement_tables(of.requirements, of.book),
     ),
     TableKind("summary", "terminal index.html", lambda of: summary(of.book)),
     TableKind("seeds", "leaderboard.md leaderboard.tex index.html", lambda of: [seed_table(of.entries)]),

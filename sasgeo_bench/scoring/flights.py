@@ -40,6 +40,7 @@ NEES_BAND: Final = tuple(float(chi2.ppf(tail, SIDE)) / SIDE for tail in (0.025, 
 FRESH_S: Final = 30.0  # age up to which a fix is of use: some 300 m flown, of which a fair odometer loses 1 %
 HOLDS_S: Final = 60.0  # window of continuity; ICAO's of an approach is 15 s, of a flight en route an hour
 _AGE_SHARE: Final = 0.95
+AGREEING: Final = 3  # accepted fixes in a row that confirm the last of them
 _NEEDED: Final = frozenset({"distance_m", "time_s"})  # measured at each view
 _JUMP_M: Final = 1.0  # more between two views than was flown: the drone was carried
 
@@ -71,6 +72,14 @@ class FlightScore:
     right_accepted: Annotated[float, "Share of the views with one within 25 m"]
     false_accepted: Annotated[float, "Share of the views with one beyond"]
     false_of_accepted: Annotated[float, "Share of the accepted fixes that are false; 0 where none is accepted"]
+    right_confirmed: Annotated[
+        float,
+        "Share of the views with a confirmed fix within 25 m: one that agrees with the accepted fix before it, which "
+        "agrees with the one before. Two agree if the odometer leads from the first to within 25 m of the second",
+    ]
+    false_confirmed: Annotated[float, "Share of the views with a confirmed fix beyond"]
+    false_of_confirmed: Annotated[float, "Share of the confirmed fixes that are false; 0 where none is confirmed"]
+    first_confirmed_m: Annotated[float, "Distance to the first confirmed fix within 25 m; infinite without one"]
     right_per_km: Annotated[float, "Accepted fixes within 25 m over kilometres"]
     false_per_km: Annotated[float, "Those beyond over kilometres"]
     longest_without_fix_m: Annotated[
@@ -301,6 +310,7 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
     first_fix_m = _first(distance_m - distance_m[0], right)
     event = _event(column["is_seen"] & column["is_present"], column["is_carried"])
     reckoned, answered = _Reckoned.of(views, increments), column["is_answered"].astype(bool)
+    confirmed = reckoned.confirmed()
     nees = float(column["nees"][answered].mean()) if answered.any() else math.inf
     time_s = column["time_s"].astype(float)
     return FlightScore(
@@ -312,6 +322,10 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
         right_accepted=float(right.mean()),
         false_accepted=float(false.mean()),
         false_of_accepted=float(false.sum() / max(1, accepted.sum())),
+        right_confirmed=float((confirmed & right).mean()),
+        false_confirmed=float((confirmed & false).mean()),
+        false_of_confirmed=float((confirmed & false).sum() / max(1, confirmed.sum())),
+        first_confirmed_m=_first(distance_m - distance_m[0], confirmed & right),
         right_per_km=float(right.sum()) * per_km,
         false_per_km=float(false.sum()) * per_km,
         longest_without_fix_m=_longest(distance_m, right),
@@ -481,6 +495,7 @@ class _Reckoned:
     fixes: Complexes
     fix_yaw: Floats  # radians
     accepted: Bools
+    has_step: Bools  # the odometer says what lies between the view and the one before
     is_lost: Bools  # on the way to the view: by the odometer, or since the drone was carried
     way: Complexes
     turn: Floats  # radians
@@ -498,6 +513,7 @@ class _Reckoned:
             fixes=column["east_m"] + 1j * column["north_m"],
             fix_yaw=np.radians(views["yaw_deg"].to_numpy(float)),
             accepted=views["is_accepted"].to_numpy(bool),
+            has_step=np.array([one is not None for one in increments]),
             is_lost=np.array([one is None for one in increments]) | views["is_carried"].to_numpy(bool),
             way=way_m[:, 0] + 1j * way_m[:, 1],
             turn=np.cumsum(np.radians(steps[:, 2])),
@@ -514,6 +530,24 @@ class _Reckoned:
         turned = np.exp(-1j * (self.true_yaw[first] - self.turn[first]))
         off = np.abs(self.true[first] + (self.way[last] - self.way[first]) * turned - self.true[last])
         return min(1.0, float(np.mean(off / (self.distance_m[last] - self.distance_m[first]))))
+
+    def confirmed(self) -> Bools:
+        """Return which views have an accepted fix that the ones before confirm: `AGREEING` in a row agree.
+
+        Two agree if the odometer, which knows nothing of being carried, leads from the first to within 25 m of the
+        second. It cannot where it lost its way.
+        """
+        at = np.flatnonzero(self.accepted)
+        first, second = at[:-1], at[1:]
+        turned = np.exp(-1j * (self.fix_yaw[first] - self.turn[first]))
+        off_m = np.abs(self.fixes[first] + (self.way[second] - self.way[first]) * turned - self.fixes[second])
+        steps = np.cumsum(self.has_step)
+        agree = (off_m <= FIX_M) & (steps[second] - steps[first] == second - first)
+        found = np.zeros(len(self.accepted), dtype=bool)
+        in_a_row = AGREEING - 1
+        if len(agree) >= in_a_row:
+            found[at[in_a_row:]] = np.convolve(agree, np.ones(in_a_row), "valid") == in_a_row
+        return found
 
     def error_m(self, every_m: float) -> Floats:
         """Return the error of every view if a fix is used once in some metres at most, and the odometer then."""

@@ -26,6 +26,7 @@ from sasgeo_bench.scoring.decisions import (
     false_fix_rate,
 )
 from sasgeo_bench.scoring.flights import (
+    AGREEING,
     FRESH_S,
     HOLDS_S,
     NEES_BAND,
@@ -163,6 +164,18 @@ MEANS: Final = (
         better="higher",
     ),
     _flight_mean(
+        "right_confirmed",
+        f"Share of the views with a confirmed fix within 25 m: the last of {AGREEING} accepted ones in a row of which "
+        "the odometer leads from each to within 25 m of the next",
+        better="higher",
+    ),
+    _flight_mean("false_confirmed", "Share of the views with a confirmed fix beyond 25 m", read_with="right_confirmed"),
+    _flight_mean(
+        "false_of_confirmed",
+        "Share of a flight's confirmed fixes that are beyond 25 m; 0 where none is confirmed",
+        read_with="right_confirmed",
+    ),
+    _flight_mean(
         "available_30s",
         f"Availability: share of the time with an accepted fix, right or not, that is {FRESH_S:g} s old at most. There "
         "is none before the first",
@@ -230,6 +243,13 @@ FLIGHT_QUANTILES: Final = (
         f"small in each direction; infinite if an estimate has none{_LOWER}",
         source="Bar-Shalom, Li and Kirubarajan, Estimation with Applications, 2001, section 5.4",
         column="nees_off",
+    ),
+    _quantile(
+        name="first_confirmed",
+        meaning="Median over flights of the distance to the first confirmed fix within 25 m, which comes later than "
+        f"first_fix by the delay of confirmation; infinite without one{_LOWER}",
+        unit="m",
+        column="first_confirmed_m",
     ),
     _quantile(
         name="nees",

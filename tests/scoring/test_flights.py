@@ -434,3 +434,34 @@ def test_the_band_of_nees_is_that_of_one_view_and_takes_no_covariance_for_a_faul
     assert (honest["nees"], honest["nees_in_band"]) == (pytest.approx(1 / 3), True)
     assert score_of(heads, truths, answers(truths, off_m=[20.0] * 11))["nees_in_band"] is False
     assert score_of(heads, truths, answers(truths, covariance=None))["nees_in_band"] is False
+
+
+def test_a_fix_is_confirmed_by_two_accepted_ones_before_it_that_agree_by_the_odometer():
+    heads, truths = a_flight(12)
+    off_m = [400.0, 0.0, 0.0, 0.0, 0.0, 400.0, 400.0, 400.0, 0.0, 20.0, 40.0, 65.1]
+    row = score_of(heads, truths, answers(truths, off_m=off_m))
+    # Views 3 and 4 close a row of three; 7 one of false fixes; 10 one that creeps away, and 11 is too far from 10.
+    assert row["right_confirmed"] == pytest.approx(2 / 12)
+    assert row["false_confirmed"] == pytest.approx(2 / 12)
+    assert row["false_of_confirmed"] == 0.5
+    assert (row["first_fix_m"], row["first_confirmed_m"]) == (100.0, 300.0)
+
+
+def test_fixes_that_are_not_accepted_in_between_break_no_row_and_an_odometer_that_is_lost_does():
+    heads, truths = a_flight(9)
+    accepted = [at not in (1, 4) for at in range(9)]
+    row = score_of(heads, truths, answers(truths, accepted=accepted))
+    assert row["right_confirmed"] == pytest.approx(5 / 9)  # 3, 5, 6, 7, 8
+    lost = [replace(head, increment=None) if head.frame == 5 else head for head in heads]
+    row = score_of(lost, truths, answers(truths, accepted=accepted))
+    assert row["right_confirmed"] == pytest.approx(3 / 9)  # 3, 7, 8
+    few = score_of(heads, truths, answers(truths, accepted=[at < 2 for at in range(9)]))
+    assert (few["right_confirmed"], few["first_confirmed_m"]) == (0.0, math.inf)
+    turned = a_flight(6)
+    row = score_of(turned[0], turned[1], answers(turned[1]))
+    assert row["right_confirmed"] == pytest.approx(4 / 6)
+    odd = {
+        name: replace(one, candidates=((replace(one.candidates[0][0], yaw_deg=0.0), 1.0),))
+        for name, one in answers(turned[1]).items()
+    }
+    assert score_of(turned[0], turned[1], odd)["right_confirmed"] == 0.0  # its heading leads the odometer astray

@@ -17,7 +17,7 @@ SOURCES := sasgeo_bench baselines paper benchmarks tests docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo head-start list-regions build-region queries leaderboard test test-of test-quick test-torch test-oldest test-wheel check bench ageing figures docs lock clean
+.PHONY: help install demo head-start list-regions build-region queries leaderboard test test-of test-quick test-torch test-oldest test-wheel check bench ageing figures docs lock wheels-arm clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
@@ -97,7 +97,7 @@ test-torch: $(STAMP) ## install the extra [torch] of both packages and run the t
 
 test-oldest: ## run the tests of test-quick with the oldest dependencies that pyproject.toml allows, in .venv-oldest (needs uv)
 	$(PYTHON) -m venv .venv-oldest
-	$(UV) pip compile --quiet --resolution lowest-direct --extra dask --extra publish --extra dev pyproject.toml -o .venv-oldest/oldest.txt
+	$(UV) pip compile --quiet --resolution lowest-direct --extra dask --extra logs --extra publish --extra dev pyproject.toml -o .venv-oldest/oldest.txt
 	$(UV) pip install --quiet --python .venv-oldest/bin/python -r .venv-oldest/oldest.txt
 	$(UV) pip install --quiet --python .venv-oldest/bin/python --no-deps --no-build-isolation -e . -e baselines -e paper
 	.venv-oldest/bin/python -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
@@ -155,13 +155,21 @@ docs: $(DOCS_STAMP) ## build the documentation site in OUT/docs, strictly; DOCS_
 	DOCS_RUN=$(DOCS_RUN) NO_MKDOCS_2_WARNING=1 $(VENV_PYTHON) -m mkdocs build --strict --site-dir $(abspath $(OUT))/docs $(ARGS)
 
 lock: ## resolve requirements.lock and requirements-docs.lock anew from pyproject.toml (needs uv: make lock UV=/path/to/uv)
-	$(UV) pip compile pyproject.toml --extra dev --extra dask --extra publish --universal --python-version 3.11 --generate-hashes --no-config \
+	$(UV) pip compile pyproject.toml --extra dev --extra dask --extra logs --extra publish --universal --python-version 3.11 --generate-hashes --no-config \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
 	  --output-file requirements.lock $(ARGS)
 	$(UV) pip compile --group pyproject.toml:docs --constraint requirements.lock --universal --python-version 3.11 --generate-hashes --no-config \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
 	  --output-file requirements-docs.lock $(ARGS)
 
+# Nothing is installed. jsonpath-rw, of the extra [publish], has a wheel on no system: it is Python alone.
+wheels-arm: ## check that every package of requirements.lock has a wheel for Linux on aarch64, glibc 2.28 (needs uv)
+	for version in 3.11 3.12 3.13; do \
+	  $(UV) pip install --quiet --dry-run --no-config --require-hashes --only-binary :all: --no-binary jsonpath-rw \
+	    --python-platform aarch64-manylinux_2_28 --python-version $$version --target .venv-arm -r requirements.lock || exit 1; \
+	done
+	rm -r .venv-arm
+
 clean: ## remove .venv and caches; keeps what was built in $(OUT)
-	rm -rf $(VENV) .venv-oldest .venv-wheel .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
+	rm -rf $(VENV) .venv-oldest .venv-wheel .venv-arm .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +

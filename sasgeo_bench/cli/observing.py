@@ -21,6 +21,7 @@ from sasgeo_bench.observing.fixes import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTE
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results
+from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
 _PAIR: Final = re.compile(r"\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*,\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*")
@@ -34,9 +35,10 @@ class LocateOptions(Options):
     pictures: Annotated[Path, typer.Argument(help="a picture, or a folder of them (JPEG, PNG, WebP, GeoTIFF)")] = field(
         kw_only=False
     )
-    region: Annotated[str | None, typer.Option(help="built region, or its folder; default: the newest that fits")] = (
-        None
-    )
+    region: Annotated[
+        str | None,
+        typer.Option(help="built region, its folder, or a packed map (*.map); default: the newest that fits"),
+    ] = None
     near: Annotated[str | None, typer.Option(help="LON,LAT of the middle of the search; default: the file's")] = None
     radius: Annotated[float, typer.Option(help="of the search, metres")] = RADIUS_M
     heading: Annotated[
@@ -86,6 +88,10 @@ def locate(options: LocateOptions) -> Located:
         ...
     sasgeo_bench.core.errors.ImageError: there is no picture or folder garden.jpg: check the path
     """
+    if options.region is not None and is_packed_map(Path(options.region)):
+        weights = unpack_map(options.region, options.out).about.weights
+        if weights is not None:
+            tell(f"what {weights.matcher} has learned is left packed: P(false fix) is calibrated without it")
     into = options.into or options.out / "locate" / _name_of(options.pictures)
     heading = None if options.heading in (None, "any") else _heading(options.heading or "")
     request = LocateRequest(

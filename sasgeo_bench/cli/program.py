@@ -35,10 +35,10 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     },
     "Regions": {
         "new-region": "regions",
-        "propose-regions": "regions",
         "build-region": "regions",
         "render-imagery": "regions",
         "measure-ageing": "ageing",
+        "pack-map": "regions",
     },
     "Your own pictures": {
         "locate": "observing",
@@ -76,12 +76,11 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "fetch": "publishing",
     },
     "Flights": {
-        "read-flight": "flights",
+        "import-flight": "flights",
         "measure-drift": "flights",
     },
     "Datasets of others": {
         "import-dataset": "importing",
-        "locate-dataset": "importing",
     },
 }
 
@@ -94,13 +93,15 @@ ALIASES: Final = {
     **{f"new-{kind}": ("new", kind) for kind in ("matcher", "tracker", "segmenter")},
     **{f"check-{kind}": ("check", "--kind", kind) for kind in ("matcher", "tracker", "segmenter")},
     "validate": ("verify",),
+    "read-flight": ("import-flight",),
     "compare-ageing": ("measure-ageing", "--compare"),
+    "propose-regions": ("new-region", "--manifest"),
+    "locate-dataset": ("import-dataset", "--where"),
 }
 
 # Command -> what is kept of it when it is interrupted, and how to go on; the others write all or nothing.
 KEPT: Final = {
-    "new-region": "what was downloaded is kept; the same command goes on from there",
-    "propose-regions": "files that were written are kept; the same command writes the others",
+    "new-region": "what was downloaded and written is kept; the same command goes on from there",
     "build-region": "regions that were built are kept; the same command builds the others",
     "render-imagery": "images that were rendered are kept; the same command renders the others",
     "make-queries": "tasks that were drawn are kept; the same command draws them again, with the same queries",

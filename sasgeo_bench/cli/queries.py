@@ -14,13 +14,14 @@ from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, OwnRegi
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.progress import reported, spread, tell
+from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
 from sasgeo_bench.tasks.query import PROFILE, Detector, PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import SUITES
 from sasgeo_bench.tasks.suites.base import Choice
-from sasgeo_bench.tasks.task_plan import Request, TaskRequest, plan_requests, root_of
+from sasgeo_bench.tasks.task_plan import SPLIT, Request, TaskRequest, plan_requests, root_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,12 @@ class QueryOptions(Options):
             "--regions", help="id from list regions, or own file; may be repeated; default: all that can be built"
         ),
     ] = None
-    split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit"
+    split: Annotated[
+        str | None,
+        typer.Option(
+            help=f"id of a shipped split, or a file of your own (*.toml); default: {SPLIT}; an own place is all test"
+        ),
+    ] = None
     n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8
     seed: Annotated[int | None, typer.Option(min=0, help="public random seed; default: 0")] = None
     seed_file: SeedFile = None
@@ -56,6 +62,11 @@ class QueryOptions(Options):
     extracts: ExtractFolders = None
     region_files: OwnRegionFolders = None
     out: Out = Path("out")
+    flight: Annotated[
+        Path | None,
+        typer.Option(help="log of a flight that was flown, for suites of flights; it is their one site"),
+    ] = None
+    height: Annotated[float | None, typer.Option(help="of that flight above the ground, instead of the log's")] = None
     up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False
     skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False
@@ -91,7 +102,7 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
         suites=tuple(options.suite or SUITES),
         regions=tuple(options.regions or ()),
         split=options.split,
-        count=options.n,
+        count=options.n if options.flight is None else 1,
         seed=private or options.seed or 0,
         group=PriorGroup.parse(options.prior) if options.prior else None,
         extract_folders=tuple(options.extracts or ()),
@@ -99,6 +110,7 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
         out=root_of(options.out, private),
         may_be_fewer=options.up_to,
         choice=_choice(options),
+        flown=_flown(options),
     )
     requests = plan_requests(wanted)
     if options.dry_run:
@@ -114,6 +126,14 @@ def make_queries_command(options: QueryOptions) -> None:
     """Draw queries into OUT/tasks/<suite>/<region>/ and their truths into OUT/truth/<suite>/<region>/."""
     with shown_progress():
         make_tasks(**vars(options) | {"say": say})
+
+
+def _flown(options: QueryOptions) -> FlownPath | None:
+    if options.flight is None:
+        if options.height is not None:
+            raise ConfigError("--height is of a flight: name its log by --flight")
+        return None
+    return FlownPath(file=options.flight, height_m=options.height)
 
 
 def _folder(request: Request) -> Path:

@@ -137,6 +137,8 @@ def _request_sha256(request: Request) -> str:
         "group": None if request.group is None else request.group.name,
         "made_by": version("sasgeo-bench"),
     }
+    if request.flown is not None:
+        content["flown"] = request.flown.key
     if request.choice != EVERYTHING:  # tasks that are older than this field stay valid
         choice = asdict(replace(request.choice, profile=None))
         del choice["profile"]
@@ -178,7 +180,10 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
     suite = replace(suite, variants=suite.usable(scene))
     if isinstance(suite, FlightSuite):
         over = base if scene.pictured is None else base.within(scene.pictured.footprint)
-        airspace = Airspace(region=over, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group)
+        flown = None if request.flown is None else request.flown.over(over, margin_m=suite.clear_m(scene))
+        airspace = Airspace(
+            region=over, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group, flown=flown
+        )
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
         airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))
         pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice)

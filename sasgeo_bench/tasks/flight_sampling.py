@@ -91,7 +91,10 @@ def pose_of(views: Trajectory, frame: int, scale: float) -> Pose:
 
 @dataclass(frozen=True, kw_only=True)
 class Airspace:
-    """Where the flights of a suite may go, and the seeds of region and suite that they are drawn from."""
+    """Where the flights of a suite may go, and the seeds of region and suite that they are drawn from.
+
+    `flown` is a flight that was flown there; it is the only one then.
+    """
 
     region: Region
     scene: Scene
@@ -99,6 +102,7 @@ class Airspace:
     split: Split
     seeds: Seeds
     group: PriorGroup
+    flown: Trajectory | None = None
 
     def seeds_of(self, index: int) -> Seeds:
         """Return the seeds of one flight."""
@@ -115,6 +119,8 @@ class Airspace:
         ConfigError
             If there is room for fewer; with `may_be_fewer`, only if there is room for none.
         """
+        if self.flown is not None:
+            return {0: self._logged(self.flown)}
         flights: dict[int, Flight] = {}
         for index in range(count):
             flight = self._flight(index, list(flights.values()))
@@ -130,10 +136,9 @@ class Airspace:
 
     def _flight(self, index: int, before: Sequence[Flight]) -> Flight | None:
         """Return the longest flight that is found, of the kind whose turn it is if possible."""
-        seeds, sigmas = self.seeds_of(index), (-_SCALE_CUT, _SCALE_CUT)
+        seeds = self.seeds_of(index)
         extent_m = math.sqrt(flight_area(self.region, self.suite.clear_m(self.scene)).area)
-        scale = 1.0 + self.group.scale_sigma * float(np.clip(seeds.rng("scale").standard_normal(), *sigmas))
-        spacing_m = float(seeds.rng("spacing").uniform(*self.suite.every_m))
+        scale, spacing_m = self._scale_and_spacing_m(seeds)
         kinds = [KINDS[(index + turn) % len(KINDS)] for turn in range(len(KINDS))]
         longest_m = min(EXTENT * extent_m, self.suite.longest_m)
         for length_m in (length_m for length_m in LENGTHS_M if length_m <= longest_m):
@@ -151,6 +156,36 @@ class Airspace:
                     site = Site(index=index, pose=pose_of(views, 0, scale), block=self._block(views), density=0.0)
                     return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot)
         return None
+
+    def _scale_and_spacing_m(self, seeds: Seeds) -> tuple[float, float]:
+        sigmas = float(np.clip(seeds.rng("scale").standard_normal(), -_SCALE_CUT, _SCALE_CUT))
+        return 1.0 + self.group.scale_sigma * sigmas, float(seeds.rng("spacing").uniform(*self.suite.every_m))
+
+    def _logged(self, flown: Trajectory) -> Flight:
+        """Return the flight that was flown, or raise `ConfigError` that says why it cannot be asked."""
+        seeds = self.seeds_of(0)
+        scale, spacing_m = self._scale_and_spacing_m(seeds)
+        views = _spaced(flown, float(flown.distance_m[-1]), spacing_m, seeds.rng("path", "flown"))
+        where, plot = self.scene.map.region, None
+        if not self._is_in_one_part(views):
+            raise ConfigError(
+                f"the flight over {where} crosses blocks of several parts of split {self.split.spec.id!r}, or ground "
+                "outside of them: name a split in which the region is one place, as new-split proposes"
+            )
+        if not self._is_shown(views, scale):
+            raise ConfigError(f"the flight over {where} leaves what suite {self.suite.card.name!r} can show")
+        if isinstance(self.suite, ChangedMapSuite):
+            plot = self._plot(views, (), seeds.rng("plot", "flown"))
+            if plot is None:
+                raise ConfigError(
+                    f"the flight over {where} leaves no room for what suite {self.suite.card.name!r} changes"
+                )
+        if not self._is_drawn(views, scale):
+            raise ConfigError(
+                f"the flight over {where} sees too little that is mapped: {self.suite.card.min_density:.0%} are needed"
+            )
+        site = Site(index=0, pose=pose_of(views, 0, scale), block=self._block(views), density=0.0)
+        return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot)
 
     def _plot(self, views: Trajectory, before: Sequence[Flight], rng: np.random.Generator) -> Plot | None:
         """Return how maps are changed for a flight after those before it; None if they are not, or have no room."""
@@ -187,10 +222,7 @@ class Airspace:
             path_m = plan_flight(self.region, kind, length_m=length_m, rng=rng, margin_m=margin_m)
         except FlightError:
             return None
-        flown = fly(path_m, height_m=HEIGHT_M, rng=rng)
-        steps_m = spacing_m * rng.uniform(*UNEVEN, math.ceil(length_m / (spacing_m * min(UNEVEN))))
-        at_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-        return flown.at(np.interp(at_m[at_m < flown.distance_m[-1]], flown.distance_m, flown.time_s))
+        return _spaced(fly(path_m, height_m=HEIGHT_M, rng=rng), length_m, spacing_m, rng)
 
     def _is_in_one_part(self, *flown: Trajectory) -> bool:
         """Return whether all views are centred in blocks of one part of the split: what trains must not be tested."""
@@ -217,6 +249,13 @@ class Airspace:
         poses = [pose_of(views, frame, scale) for frame in range(len(views))]
         means = [np.mean([drawn_share(state, pose, variant) for pose in poses]) for state in maps]
         return float(min(means)) >= self.suite.card.min_density
+
+
+def _spaced(flown: Trajectory, length_m: float, spacing_m: float, rng: np.random.Generator) -> Trajectory:
+    """Return the poses of the views along a path of about a length, unevenly spaced by so much on average."""
+    steps_m = spacing_m * rng.uniform(*UNEVEN, math.ceil(length_m / (spacing_m * min(UNEVEN))))
+    at_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    return flown.at(np.interp(at_m[at_m < flown.distance_m[-1]], flown.distance_m, flown.time_s))
 
 
 def _placed(shape: Trajectory, middle_m: Floats, carried_m: float, rng: np.random.Generator) -> Trajectory:

@@ -11,6 +11,7 @@ import numpy as np
 
 from sasgeo_bench.core.errors import ConfigError, ExtractError, ImageryError
 from sasgeo_bench.core.progress import tell
+from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
@@ -18,10 +19,13 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.split import Split, find_split_file, list_split_files, make_split, read_split_file
+from sasgeo_bench.tasks.split_proposal import propose_split
 from sasgeo_bench.tasks.suites.ages import AGES_YEARS, DAYS_PER_YEAR
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Need, Suite
+from sasgeo_bench.tasks.suites.flights import FlightSuite
 
+SPLIT: Final = "crossfit"
 PRIVATE_ROOT: Final = "private"  # below the root of public queries, so that no folder holds both
 
 
@@ -31,7 +35,7 @@ class Settings:
 
     `count` is the number of sites, each with all variants of a suite; with `may_be_fewer`, fewer will do if the region
     holds no more. Priors are those of the suite unless `group` is given. `choice` selects variants and does not change
-    their queries.
+    their queries. With `flown`, suites of flights draw the views of that flight, which is their one site.
     """
 
     count: int
@@ -41,6 +45,7 @@ class Settings:
     extract_folders: tuple[Path, ...] = ()
     may_be_fewer: bool = False
     choice: Choice = EVERYTHING
+    flown: FlownPath | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,12 +93,13 @@ class Request(Settings):
 class TaskRequest(Settings):
     """Suites, a split, and regions as ids or files; without regions, all of the split that can be built.
 
+    Without a split it is `SPLIT`, or, of a single place that this does not speak of, one in which all of it is test.
     `sealed_seed` draws the sealed places of the split; without it they are left out.
     """
 
     suites: tuple[str, ...]
     regions: tuple[str, ...]
-    split: str
+    split: str | None = None
     region_folders: tuple[Path, ...] = ()
     sealed_seed: PrivateSeed | None = None
 
@@ -113,6 +119,9 @@ def plan_requests(wanted: TaskRequest) -> tuple[Request, ...]:
         raise ConfigError(fault)
     check_count(wanted.count)
     check_roots(wanted.out)
+    other = next((name for name, suite in suites.items() if not isinstance(suite, FlightSuite)), None)
+    if wanted.flown is not None and other is not None:
+        raise ConfigError(f"--flight is for suites of flights, such as flight-clean, and {other} is none")
     files = list_region_files(folders=wanted.region_folders)
     known = {name: read_region_file(path) for name, path in files.items()}
     named = [
@@ -120,9 +129,7 @@ def plan_requests(wanted: TaskRequest) -> tuple[Request, ...]:
         for name in wanted.regions
     ]
     known |= {spec.id: spec for spec in named}
-    split = make_split(
-        read_split_file(find_split_file(wanted.split)), {name: item.grid() for name, item in known.items()}
-    )
+    split = _split(wanted, named, known)
     if not named:
         listed = [known[name] for name in split.spec.region_ids]
         named = [item for item in listed if is_reachable(item, wanted.extract_folders, wanted.out)]
@@ -147,6 +154,17 @@ def plan_requests(wanted: TaskRequest) -> tuple[Request, ...]:
     )
 
 
+def _split(wanted: TaskRequest, named: Sequence[RegionFile], known: Mapping[str, RegionFile]) -> Split:
+    grids = {name: item.grid() for name, item in known.items()}
+    spec = read_split_file(find_split_file(wanted.split or SPLIT))
+    if wanted.split is None and named and not set(spec.region_ids) & {item.id for item in named}:
+        own = propose_split(named[0].id, named)
+        if len(own.place) == 1:
+            tell(f"split: {own.id} is one place, all of it test")
+            return make_split(own, grids)
+    return make_split(spec, grids)
+
+
 def _elsewhere(
     wanted: TaskRequest, suite: Suite, split: Split, region: RegionFile, known: Mapping[str, RegionFile]
 ) -> RegionFile | None:
@@ -164,7 +182,7 @@ def _other_split(region: str) -> str:
     found = next(
         (name for name, path in list_split_files().items() if region in read_split_file(path).region_ids), None
     )
-    return "add it to a split file of your own" + (f", or use --split {found}" if found else "")
+    return "new-split makes a split of your own" + (f", or use --split {found}" if found else "")
 
 
 def _without_sealed(named: Mapping[str, RegionFile], split: Split, wanted: TaskRequest) -> tuple[RegionFile, ...]:

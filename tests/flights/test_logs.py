@@ -3,6 +3,9 @@
 
 import datetime as dt
 import gzip
+import io
+import sys
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,15 +17,18 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights import log_points
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import read_flight, read_log
 from sasgeo_bench.flights.plans import flight_area
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sensing.camera import Attitude
+from sasgeo_bench.sensing.ground import Dem
+from tests.sensing.test_ground import write_dem
 
 LON, LAT = 9.52, 47.14
 START = dt.datetime(2025, 5, 1, 10, tzinfo=dt.UTC)
@@ -104,11 +110,16 @@ def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(written, mod
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [
-        ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>"), "elevations, which are above the sea"),
-        ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"), "altitudes, which are not relative to the ground"),
+        ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>", 3),
+         "altitudes, which are not those of all points"),
+        ("b.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>").replace("480", "-.-", 1),
+         "altitudes, which are not those of all points"),
+        ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"),
+         "altitudes, which are neither relative to the ground nor absolute"),
         ("a.csv", "lat,lon,height_furlong,heading_mil\n1,1,2,3\n1,2,2,3", "'height_furlong', 'heading_mil'"),
-        ("b.csv", "lat,lon,date,altitude_m,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
-         "'date', 'altitude_m'; altitudes above"),
+        ("b.csv", "lat,lon,date,altitude,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
+         "'date', 'altitude'; an altitude is read if one column of them states its unit"),
+        ("e.csv", "lat,lon,altitude_m,time_s,\n1,1,2,1,\n1,1.00001,,3,", "'altitude_m'; an altitude is read if"),
         ("c.csv", "lat,lon,pitch_deg,\x1b[31m\n1,1,2,3\n1,2,2,3", "'pitch_deg', '?[31m'"),
         ("d.csv", "lat,lon," + ",".join(f"c{at:0>99}" for at in range(99)), "'c000"),
     ],
@@ -137,6 +148,36 @@ def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(writt
     )
     log = read_log(written("a.kml", text))
     assert (log.time_s.tolist(), log.height_m.tolist()) == ([0, 1, 2], [60, 60, 60])
+    assert (log.start_s, log.altitude_m) == (START.timestamp(), None)
+    above_sea = read_log(written("b.kml", text.replace("relativeToGround", "absolute").replace("Z</when>", "</when>")))
+    assert (above_sea.altitude_m.tolist(), above_sea.altitude_of) == ([60, 60, 60], "geoid")
+    assert (above_sea.height_m, above_sea.start_s) == (None, None)  # a time without a zone
+
+
+def test_a_kmz_is_the_kml_in_its_root(written: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = LINE.format("9.52,47.14,80 9.53,47.15,90")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("files/other.kml", "<kml/>")
+        archive.writestr("doc.kml", line)
+    path = tmp_path / "a.KMZ"
+    path.write_bytes(packed.getvalue())
+    assert read_log(path).lat_deg.tolist() == read_log(written("a.kml", line)).lat_deg.tolist()
+    with monkeypatch.context() as patch:
+        patch.setattr(log_points, "MOST_BYTES", 10_000)
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("doc.kml", line + " " * 99_999)
+        assert "bytes unpacked: keep the track alone" in _refused(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("files/other.kml", line)
+    assert "holds no KML in its root" in _refused(path)
+
+
+def test_a_gpx_track_starts_in_utc_and_does_not_say_which_sea_its_elevations_count_from(written: Callable) -> None:
+    log = read_log(written("a.gpx", _gpx(_points()).replace("<time>", "<ele>480.5</ele><time>")))
+    assert (log.start_s, log.altitude_m.tolist(), log.altitude_of) == (START.timestamp(), [480.5] * 5, "unknown")
+    bare = read_log(written("b.gpx", _gpx(_points(), times=False)))
+    assert (bare.start_s, bare.altitude_m, bare.height_m) == (None, None, None)
 
 
 @pytest.mark.parametrize(
@@ -220,8 +261,8 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(wri
         ("a.kml", LINE.format("9,47 9,48").replace("</Document>", "<LineString/></Document>"), "2 lines or tracks"),
         ("a.kml", LINE.format("9.52, 47.14"), "point 1: longitude is no number|latitude is missing|is no longitude"),
         ("a.kml", LINE.format("9.52 47.14"), "point 1: '9.52' is no longitude, latitude and altitude"),
-        ("a.kmz", "PK",
-         r"no flight log that is read: .gpx, .kml, .csv, .pos, .tum, .*\(unzip a .kmz, export a .ulg by ulog2csv"),
+        ("a.kmz", "PK", "no sound KMZ"),
+        ("a.zip", "PK", "no flight log that is read: .gpx, .kml, .kmz, .ulg, .*.csv, .pos, .tum, .txt, .*gz are"),
     ],
 )  # fmt: skip
 def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(written, name, text, match) -> None:
@@ -341,7 +382,7 @@ def test_a_log_is_cut_at_a_gap_unless_it_has_no_times(written: Callable, region:
 
 def test_a_log_that_leaves_is_refused_in_one_line_with_the_longest_stretch(written: Callable, region: Region) -> None:
     near = written("b.csv", _table(region, _across(region)[:100]))
-    with pytest.raises(FlightError, match=r"leaves town-grid: of \d+ m .* has 40\d m, 1000 m are .* --margin-m or --l"):
+    with pytest.raises(FlightError, match=r"leaves town-grid: of \d+ m .* has 40\d m, 1000 m are .* a smaller --l"):
         read_flight(near, region, height_m=100.0)
     assert read_flight(near, region, height_m=100.0, least_m=400.0).distance_m[-1] > 400
 
@@ -364,8 +405,14 @@ def test_heights_come_from_the_log_or_are_given(written: Callable, region: Regio
     assert np.unique(read_flight(with_heights, region).position_m[:, 2]).tolist() == [70]
     assert np.unique(read_flight(with_heights, region, height_m=90.0).position_m[:, 2]).tolist() == [90]
     without = written("b.csv", _table(region, _across(region), more=",alt", cells=",470"))
-    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground, .*: say one, as in --height-m 100"):
+    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground: say one, as in --height 100"):
         read_flight(without, region)
+
+
+def test_a_flight_that_never_leaves_the_ground_is_refused(written: Callable, region: Region) -> None:
+    path = written("a.csv", _table(region, _across(region), more=",height_m", cells=",4.5"))
+    with pytest.raises(FlightError, match=r"a\.csv never leaves the ground: 4\.5 m above it at most, 5 m are needed"):
+        read_flight(path, region)
 
 
 def test_what_is_on_the_ground_is_left_out(written: Callable, region: Region) -> None:
@@ -430,5 +477,75 @@ def test_a_tum_file_in_the_regions_frame_is_cut_alike(tmp_path: Path, region: Re
 )
 def test_wishes_that_cannot_be_are_refused(written: Callable, region: Region, wish: dict) -> None:
     path = written("a.csv", _table(region, _across(region)))
-    with pytest.raises(FlightError, match=next(iter(wish)).replace("_m", "-m")):
+    with pytest.raises(FlightError, match=next(iter(wish)).removesuffix("_m")):
         read_flight(path, region, **({"height_m": 100.0} | wish))
+
+
+# Autopilots
+
+
+@pytest.mark.parametrize(
+    ("name", "library"), [("a.ulg", "pyulog"), ("a.bin", "pymavlink"), ("a.tlog", "pymavlink"), ("a.bag", "rosbags")]
+)
+def test_a_log_whose_library_is_not_installed_names_the_extra(
+    written: Callable, monkeypatch: pytest.MonkeyPatch, name: str, library: str
+) -> None:
+    for module in [one for one in sys.modules if one.partition(".")[0] == library]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ConfigError, match=rf"needs the package {library}: pip install 'sasgeo-bench\[logs\]'"):
+        read_log(written(name, ""))
+
+
+# Heights above the ground by altitudes
+
+
+def above_a_slope(region: Region) -> str:
+    """A GPX of a level flight due east at 600 m above the sea, over ground that rises from 400 m in the west."""
+    west, south, east, north = region.manifest.bounds_m
+    to_lonlat = pyproj.Transformer.from_crs(region.manifest.epsg, 4326, always_xy=True)
+    places = [to_lonlat.transform(x, (south + north) / 2) for x in np.arange(west, east, 10.0)]
+    points = [(lon, lat, second) for second, (lon, lat) in enumerate(places)]
+    return _gpx(points).replace("<time>", "<ele>600</ele><time>")
+
+
+def test_heights_are_altitudes_less_those_of_the_ground_or_of_the_take_off(written, region, tmp_path) -> None:
+    path = written("a.gpx", above_a_slope(region))
+    with pytest.raises(FlightError, match="say one, as in --height 100, or that of the ground by --dem or --takeoff"):
+        read_flight(path, region)
+    flown = read_flight(path, region, facts=LogFacts(takeoff_m=470.0))
+    assert np.ptp(flown.position_m[:, 2]) == 0
+    assert flown.position_m[0, 2] == 130
+    west, south, east, north = region.manifest.bounds_m
+    epsg = region.manifest.epsg
+    grid = Grid.from_bounds(west - 100, south - 100, east + 100, north + 100, cell_size_m=10.0, epsg=epsg)
+    columns = grid.west_m + 10.0 * (np.arange(grid.cols) + 0.5)
+    ground_m = np.broadcast_to(400 + 0.2 * (columns - west), (grid.rows, grid.cols))
+    dem = write_dem(tmp_path / "dem.tif", Dem(grid=grid, cells_m=ground_m.astype(np.float32)), crs=f"EPSG:{epsg}")
+    flown = read_flight(path, region, facts=LogFacts(dem=dem), least_m=500.0)
+    # down to 5 m above the ground, where the stretch ends
+    expected = 600 - (400 + 0.2 * (flown.position_m[:, 0] - west))
+    np.testing.assert_allclose(flown.position_m[:, 2], expected, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "facts", "words"),
+    [
+        ("a.gpx", {"takeoff_m": 470.0, "dem": Path("dem.tif")}, "give --height, --dem or --takeoff-height alone"),
+        ("a.gpx", {"dem": Path("none.tif")}, "none.tif"),
+        ("a.csv", {"takeoff_m": 470.0}, "a.csv has no altitude"),
+        ("a.tum", {"takeoff_m": 470.0}, "a.tum has heights: leave out --dem and --takeoff-height"),
+        ("a.kml", {"takeoff_m": 470.0}, "a.kml has no altitude"),
+    ],
+)
+def test_what_altitudes_do_not_tell_is_refused(written, region, name, facts, words) -> None:
+    west, south, east, north = region.manifest.bounds_lonlat
+    ends = [((south + north) / 2, west), ((south + north) / 2, east)]
+    texts = {
+        "a.gpx": above_a_slope(region),
+        "a.csv": _csv("lat,lon", *(f"{lat},{lon}" for lat, lon in ends)),
+        "a.tum": "0 0 0 80 0 0 0 1\n1 9 0 80 0 0 0 1\n",
+        "a.kml": LINE.format(" ".join(f"{lon},{lat}" for lat, lon in ends)),
+    }
+    with pytest.raises(FlightError, match=words):
+        read_flight(written(name, texts[name]), region, facts=LogFacts(**facts))

@@ -30,6 +30,7 @@ from sasgeo_bench.observing.fixes import COLUMNS, Fix, LocateRequest, verdict
 from sasgeo_bench.observing.locate import answer_key, locate, map_of
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import csv_text, geojson_text, gpx_text, kml_text, page_text, tum_text
+from sasgeo_bench.regions.packed_map import pack_map
 from sasgeo_bench.sensing.crops import drawn_crops
 
 TOWN = "town-riverside"
@@ -141,6 +142,16 @@ def test_a_second_call_asks_nothing_anew_and_tries_what_failed(located, towns, p
     )
     assert asked == ["b.jpg"]
     assert [replace(fix, seconds=0.0) for fix in again.fixes] == [replace(fix, seconds=0.0) for fix in found.fixes]
+
+
+@pytest.mark.slow
+def test_a_packed_map_gives_the_same_fixes(located, towns, pictures, tmp_path):
+    pack_map(towns / "regions" / TOWN, tmp_path / "town.map")
+    width, region = SIDE_PX * PIXEL_M, str(tmp_path / "town.map")
+    words = {"ground_width": width, "region": region, "most_false": 0.1, "trusted": True}
+    found = sgb.locate(pictures, out=tmp_path / "out", into=tmp_path / "into", **words)
+    assert [replace(fix, seconds=0.0) for fix in found.fixes] == [replace(fix, seconds=0.0) for fix in located[1].fixes]
+    assert (tmp_path / "into" / "index.html").is_file()
 
 
 @pytest.mark.slow

@@ -135,7 +135,7 @@ def test_a_split_that_names_an_unknown_region_is_refused(tmp_path):
 
 def test_a_region_that_the_split_does_not_speak_of_is_refused(tmp_path):
     split = own_split(tmp_path, "town-grid", "town-suburb")
-    with pytest.raises(ConfigError, match="'mine' does not speak of region 'town-riverside': add it to a split"):
+    with pytest.raises(ConfigError, match="'mine' does not speak of region 'town-riverside': new-split makes a split"):
         plan(tmp_path, split=str(split))
 
 

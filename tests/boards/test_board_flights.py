@@ -164,6 +164,7 @@ def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results
     site = publish(again.folder, tmp_path / "site", root=out).folder
     text = (site / "index.html").read_text(encoding="utf-8")
     assert "Who meets the requirements" in text
+    assert "files/requirements.parquet" in text
     assert "available_30s &gt;= 30%" in text
     (page,) = site.glob(f"suite*{SUITE}*.html")
     assert "Share of the flown distance with an estimate within 5m and 1deg" in page.read_text(encoding="utf-8")

@@ -441,8 +441,7 @@ def continuity(time_s: Floats, is_fix: Bools, age_s: float, holds_s: float) -> f
         return 0.0
     is_parted = np.diff(fixes_s) > age_s
     since_s = fixes_s[np.append(np.array([True]), is_parted)]
-    ends = np.append(is_parted, fixes_s[-1] + age_s < time_s[-1])
-    until_s = np.append(fixes_s[ends] + age_s, np.inf)[: len(since_s)]  # what is there at the end does not end
+    until_s = fixes_s[np.append(is_parted, np.array([True]))] + age_s
     whole_s = np.maximum(np.minimum(until_s, last_s) - since_s, 0.0).sum()
     held_s = np.maximum(np.minimum(until_s - holds_s, last_s) - since_s, 0.0).sum()
     return float(held_s / whole_s) if whole_s > 0 else 0.0

@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.core.errors import ConfigError
-from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.base import Floats
+from sasgeo_bench.scoring.cost import latencies_s
 from sasgeo_bench.scoring.flights import share_within
 from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, REJECTOR, TRACK, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import Interval
@@ -145,10 +146,7 @@ def is_latency(name: str) -> bool:
 
 
 def _in_time(scores: pd.DataFrame, within_s: float) -> Floats:
-    is_in_time: Bools = (scores["latency_s"] <= within_s).to_numpy(bool) & (scores["status"] != "timeout").to_numpy(
-        bool
-    )
-    return is_in_time.astype(float)
+    return (latencies_s(scores) <= within_s).astype(float)
 
 
 def _views_in_time(views: pd.DataFrame, within_s: float) -> dict[str, float]:

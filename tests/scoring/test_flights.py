@@ -455,6 +455,10 @@ def test_fixes_that_are_not_accepted_in_between_break_no_row_and_an_odometer_tha
     lost = [replace(head, increment=None) if head.frame == 5 else head for head in heads]
     row = score_of(lost, truths, answers(truths, accepted=accepted))
     assert row["right_confirmed"] == pytest.approx(3 / 9)  # 3, 7, 8
+    hover, same = a_flight(9, steps_m=[100.0] * 4 + [0.0] + [100.0] * 3)
+    assert score_of(hover, same, answers(same))["right_confirmed"] == pytest.approx(7 / 9)
+    lost = [replace(head, increment=None) if head.frame == 5 else head for head in hover]
+    assert score_of(lost, same, answers(same))["right_confirmed"] == pytest.approx(5 / 9)  # 2, 3, 4, 7, 8
     few = score_of(heads, truths, answers(truths, accepted=[at < 2 for at in range(9)]))
     assert (few["right_confirmed"], few["first_confirmed_m"]) == (0.0, math.inf)
     turned = a_flight(6)

@@ -55,7 +55,8 @@ def test_success_is_not_scored_within_less_than_two_deviations_of_the_truth():
     table = scores([1.0, 7.0, 20.0]).assign(strength=[2.0, 5.0, 2.0], strength_unit=["views", TRUTH_SIGMA, TRUTH_SIGMA])
     counts = {metric.name: metric.counts(table).tolist() for metric in means_of("localization")}
     assert counts["success_25m"] == counts["success_10m"] == [True, True, True]  # 10 m are two of 5 m
-    assert counts["success_5m"] == [True, False, True]
+    assert counts["success_5m"] == counts["within_5m"] == [True, False, True]
+    assert counts["within_5deg"] == [True, True, True]
     table = table.assign(strength=[2.0, 20.0, 5.1])
     counts = {metric.name: metric.counts(table).tolist() for metric in means_of("localization")}
     assert (counts["success_25m"], counts["success_10m"]) == ([True, False, True], [True, False, False])

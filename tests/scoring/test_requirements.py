@@ -158,7 +158,7 @@ def test_stress_counts_where_anything_is_stressed_and_controls_of_the_board_are_
 def test_an_answer_in_time_is_one_that_was_read_in_time_and_without_a_clock_nothing_is_shown():
     table = scores([1.0, 2.0, math.inf, math.inf, 3.0, 4.0] * 20, blocks=20)
     late = table.assign(
-        latency_s=[0.4, 0.41, 0.1, math.nan, math.nan, 0.2] * 20,
+        latency_s=[0.4, 0.41, 0.1, 0.3, math.nan, 0.2] * 20,
         status=["ok", "ok", "ok", "timeout", "crash", "ok"] * 20,
     )
     requirements = parse_requirements(["p30 latency 400 ms"])
@@ -216,3 +216,12 @@ def test_limits_of_flights_are_of_the_way_and_of_all_views_of_a_flight():
     assert (found.loc["p99 latency 500 ms", "figure"], found["n"].unique().tolist()) == (1.0, [12])
     assert found.loc["false <= 60%", "figure"] == pytest.approx(np.mean(off_m > 25))
     assert found.loc["false <= 60%", "accepted"] == pytest.approx(1.0)
+
+
+def test_a_tracker_that_accepts_nothing_is_not_shown_to_be_right():
+    heads, truths = ([one for at in range(12) for one in a_flight(11, f"f{at:02}")[part]] for part in (0, 1))
+    scored = score_flights(heads, truths, answers(truths, accepted=[False] * len(truths)))
+    requirements = parse_requirements(["false <= 50%"])
+    (row,) = compliance_frame(requirements, board_of({"mine": scored.flights}, requirements)).to_dict("records")
+    assert (row["figure"], row["accepted"], row["verdict"]) == (0.0, 0.0, NOT_SHOWN)
+    assert row["figure_hi"] < 0.5  # of the interval alone it would pass

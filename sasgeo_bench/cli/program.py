@@ -78,6 +78,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Flights": {
         "import-flight": "flights",
         "measure-drift": "flights",
+        "check-gnss": "flights",
     },
     "Datasets of others": {
         "import-dataset": "importing",

@@ -97,7 +97,7 @@ test-torch: $(STAMP) ## install the extra [torch] of both packages and run the t
 
 test-oldest: ## run the tests of test-quick with the oldest dependencies that pyproject.toml allows, in .venv-oldest (needs uv)
 	$(PYTHON) -m venv .venv-oldest
-	$(UV) pip compile --quiet --resolution lowest-direct --extra dask --extra publish --extra dev pyproject.toml -o .venv-oldest/oldest.txt
+	$(UV) pip compile --quiet --resolution lowest-direct --extra dask --extra logs --extra publish --extra dev pyproject.toml -o .venv-oldest/oldest.txt
 	$(UV) pip install --quiet --python .venv-oldest/bin/python -r .venv-oldest/oldest.txt
 	$(UV) pip install --quiet --python .venv-oldest/bin/python --no-deps --no-build-isolation -e . -e baselines -e paper
 	.venv-oldest/bin/python -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
@@ -155,7 +155,7 @@ docs: $(DOCS_STAMP) ## build the documentation site in OUT/docs, strictly; DOCS_
 	DOCS_RUN=$(DOCS_RUN) NO_MKDOCS_2_WARNING=1 $(VENV_PYTHON) -m mkdocs build --strict --site-dir $(abspath $(OUT))/docs $(ARGS)
 
 lock: ## resolve requirements.lock and requirements-docs.lock anew from pyproject.toml (needs uv: make lock UV=/path/to/uv)
-	$(UV) pip compile pyproject.toml --extra dev --extra dask --extra publish --universal --python-version 3.11 --generate-hashes --no-config \
+	$(UV) pip compile pyproject.toml --extra dev --extra dask --extra logs --extra publish --universal --python-version 3.11 --generate-hashes --no-config \
 	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
 	  --output-file requirements.lock $(ARGS)
 	$(UV) pip compile --group pyproject.toml:docs --constraint requirements.lock --universal --python-version 3.11 --generate-hashes --no-config \

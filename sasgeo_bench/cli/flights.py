@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands about flights: what a log holds, its stretch over a region, and the drift of odometry."""
 
+import datetime as dt
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from sasgeo_bench.core.parquet import write_frame
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, fit_profile, measure_drift, pair_run
 from sasgeo_bench.flights.drift_profile import write_drift_profile
+from sasgeo_bench.flights.log_odometry import LoggedRuns, read_runs
 from sasgeo_bench.flights.log_points import FlightLog, steps_m
 from sasgeo_bench.flights.log_units import SPEED_MPS, AngleUnit, HeightUnit, LogFacts, PlaceUnit, TimeUnit
 from sasgeo_bench.flights.logs import gaps_of, is_tum, read_flight, read_log, read_poses
@@ -36,7 +38,12 @@ AxesFlag = Annotated[
 class FlightOptions(Options):
     """Flags of `read-flight`."""
 
-    file: Annotated[Path, typer.Argument(help="GPX, KML, CSV, RTKLIB .pos, or TUM in the region's CRS (.tum, .txt)")]
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="GPX, KML, KMZ, CSV, RTKLIB .pos, ULog, DataFlash, .tlog, bag, MCAP, or TUM in the region's CRS"
+        ),
+    ]
     region: Annotated[Path | None, typer.Option(help="folder of a built region: cut the flight to it")] = None
     tum: Annotated[Path | None, typer.Option(help="TUM file to write the stretch over the region into")] = None
     height_m: Annotated[float | None, typer.Option(help="height above the ground to keep, instead of the log's")] = None
@@ -61,6 +68,7 @@ class FlightOptions(Options):
     ] = None
     place_unit: Annotated[PlaceUnit | None, typer.Option(help="of latitude and longitude (e7: 1e-7 degrees)")] = None
     axes: AxesFlag = None
+    vehicle: Annotated[int | None, typer.Option(help="system id of the vehicle in a .tlog of several")] = None
 
     @property
     def facts(self) -> LogFacts:
@@ -72,6 +80,7 @@ class FlightOptions(Options):
             place_unit=self.place_unit,
             axes=self.axes,
             speed_mps=self.speed_mps,
+            vehicle=self.vehicle,
         )
 
 
@@ -103,33 +112,83 @@ def read_flight_command(flight: FlightOptions) -> None:
         _show(read_log(flight.file, flight.facts, height_m=flight.height_m), flight.speed_mps or SPEED_MPS)
 
 
-def measure_drift_command(
-    truth: Annotated[list[Path], typer.Option(help="true trajectory, TUM format, plain or gzipped; may be repeated")],
-    estimate: Annotated[list[Path], typer.Option(help="estimate of it; one for each --truth, in the same order")],
-    lengths_m: Annotated[str, typer.Option(metavar="M,M,...", help="lengths of segments, metres of path")] = "10,50",
-    lost_s: Annotated[float, typer.Option(min=0, help="seconds without a pose that are a lost stretch")] = LOST_S,
-    axes: AxesFlag = None,
-    results: Annotated[Path | None, typer.Option(help="also write the figures into this Parquet file")] = None,
-    profile: Annotated[Path | None, typer.Option(help="also write a profile that was fitted, a TOML file")] = None,
-) -> None:
-    """Measure drift of odometry against truth by segment length; runs of one truth file are one cluster."""
-    lengths = _read_lengths(lengths_m)
-    _check_outputs([*truth, *estimate], [path for path in (results, profile) if path is not None])
-    runs = _read_runs(truth, estimate, lost_s, axes)
+@dataclass(frozen=True, kw_only=True)
+class DriftOptions(Options):
+    """Flags of `measure-drift`."""
+
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(help="logs: ULog, DataFlash, bags of PX4; instead of --truth and --estimate"),
+    ] = None
+    truth: Annotated[
+        list[Path] | None, typer.Option(help="true trajectory, TUM format, plain or gzipped; may be repeated")
+    ] = None
+    estimate: Annotated[
+        list[Path] | None, typer.Option(help="estimate of it; one for each --truth, in the same order")
+    ] = None
+    lengths_m: Annotated[
+        str | None,
+        typer.Option(metavar="M,M,...", help="lengths of segments, metres of path; default: 10,50; of logs 100,500"),
+    ] = None
+    lost_s: Annotated[float, typer.Option(min=0, help="seconds without a pose that are a lost stretch")] = LOST_S
+    axes: AxesFlag = None
+    results: Annotated[Path | None, typer.Option(help="also write the figures into this Parquet file")] = None
+    profile: Annotated[Path | None, typer.Option(help="also write a profile that was fitted, a TOML file")] = None
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Return the files that are read."""
+        return [*(self.logs or []), *(self.truth or []), *(self.estimate or [])]
+
+    @property
+    def lengths(self) -> list[float]:
+        """Return the lengths of segments, metres; a receiver's noise hides the drift over short ones."""
+        return _read_lengths(self.lengths_m or ("100,500" if self.logs else "10,50"))
+
+
+def measure_drift_command(drift: DriftOptions) -> None:
+    """Measure drift of odometry against truth by segment length; runs of one truth file or log are one cluster."""
+    if bool(drift.logs) == bool(drift.truth or drift.estimate):
+        raise FlightError("say either logs, or --truth and --estimate: drift is measured of one of them")
+    lengths = drift.lengths
+    _check_outputs(drift.inputs, [path for path in (drift.results, drift.profile) if path is not None])
+    if drift.logs:
+        logged = _read_logs(drift.logs, drift.lost_s, drift.axes, min(lengths))
+        runs, has_yaw = [run for one in logged for run in one.runs], all(one.has_yaw for one in logged)
+    else:
+        runs, has_yaw = _read_runs(drift.truth or [], drift.estimate or [], drift.lost_s, drift.axes), True
+    if drift.profile is not None and not has_yaw:
+        raise FlightError("a profile needs headings, and the log has none but the vehicle's: leave out --profile")
     flights = counted(len({run.sequence for run in runs}), "sequence")
     tell(f"{counted(len(runs), 'run')} of {flights}, {sum(run.path_m for run in runs):.0f} m tracked")
     figures = measure_drift(runs, lengths_m=lengths)
+    if not has_yaw:
+        figures = figures[~figures["figure"].str.startswith("yaw_")]
     print_table(_table_of(figures))
-    if results is not None:
-        with fresh_file(results, mend="name another place, or free some space") as scratch:
-            write_frame(figures, scratch, attrs={"runs": len(runs), "lost_s": lost_s})
-        tell(f"wrote {results}")
-    if profile is not None:
-        fitted = fit_profile(runs, name=profile.stem, lengths_m=lengths)
-        write_drift_profile(fitted.profile, profile)
+    if drift.results is not None:
+        with fresh_file(drift.results, mend="name another place, or free some space") as scratch:
+            write_frame(figures, scratch, attrs={"runs": len(runs), "lost_s": drift.lost_s})
+        tell(f"wrote {drift.results}")
+    if drift.profile is not None:
+        fitted = fit_profile(runs, name=drift.profile.stem, lengths_m=lengths)
+        write_drift_profile(fitted.profile, drift.profile)
         for row in fitted.parameters.to_dict("records"):
             tell(f"{row['name']} = {row['value']:.3f} [{row['lo']:.3f}, {row['hi']:.3f}]")
-        tell(f"wrote {profile}: add where the data come from and where the profile must not be believed")
+        tell(f"wrote {drift.profile}: add where the data come from and where the profile must not be believed")
+
+
+def _read_logs(logs: list[Path], lost_s: float, axes: Axes | None, shortest_m: float) -> list[LoggedRuns]:
+    """Read the odometry of logs, and print what was read of each."""
+    if axes is not None:
+        raise FlightError("logs have axes of their own: leave out --axes")
+    logged = [read_runs(path, lost_s=lost_s) for path in dict.fromkeys(logs)]
+    for path, one in zip(dict.fromkeys(logs), logged, strict=True):
+        for line in one.notes:
+            say(f"{path.name}: {line}")
+        if math.isfinite(one.accuracy_m):
+            share = 100 * one.accuracy_m / shortest_m
+            say(f"{path.name}: the receiver is good to {one.accuracy_m:.1f} m, {share:.2g} % of {shortest_m:g} m")
+    return logged
 
 
 def _summary(flown: Trajectory) -> str:
@@ -145,12 +204,15 @@ def _show(log: FlightLog, speed_mps: float) -> None:
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
     lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
     say(f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}")
+    if log.start_s is not None:
+        say(f"starts at {dt.datetime.fromtimestamp(log.start_s, tz=dt.UTC).isoformat(timespec='milliseconds')}")
     for line in (*gaps_of(log.time_s), *log.notes):
         say(line)
-    for name, unit in (("height_m", "m"), ("yaw_deg", "deg"), ("pitch_deg", "deg"), ("roll_deg", "deg")):
+    for name in ("height_m", "altitude_m", "yaw_deg", "pitch_deg", "roll_deg"):
         values = getattr(log, name)
         if values is not None:
-            say(f"{name.partition('_')[0]} from {values.min():.1f} to {values.max():.1f} {unit}")
+            what, _, unit = name.partition("_")
+            say(f"{what} from {values.min():.1f} to {values.max():.1f} {unit}")
     if log.time_s is None:
         tell(f"no times: a flight has an even speed (--speed-mps, {speed_mps:g} m/s)")
     if log.height_m is None:

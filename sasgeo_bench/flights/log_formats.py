@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
-from sasgeo_bench.flights.log_points import LogSource, listed, shown
+from sasgeo_bench.flights.log_points import AltitudeOf, LogSource, listed, shown
 from sasgeo_bench.flights.log_units import WORDS, LogFacts
 
 QUANTITIES: Final = MappingProxyType(
@@ -20,6 +20,7 @@ QUANTITIES: Final = MappingProxyType(
         "longitude": "place",
         "time": "time",
         "height": "height",
+        "altitude": "height",
         "yaw": "angle",
         "pitch": "angle",
         "roll": "angle",
@@ -45,8 +46,18 @@ NAMES: Final = MappingProxyType(
         "roll": ("roll",),
     }
 )
-# Of what no height above the ground is: altitudes, which are not read.
-ALTITUDES: Final = ("alt", "altitude", "ele", "elevation", "amsl", "alt_amsl", "altitude_amsl", "alt_msl")
+# Of what no height above the ground is: altitudes, and what they count from. The first that a table has is read.
+_NAMES_OF_ALTITUDES: Final[Mapping[AltitudeOf, tuple[str, ...]]] = MappingProxyType(
+    {
+        "geoid": (
+            *("amsl", "alt_amsl", "altitude_amsl", "alt_msl", "altitude_msl", "h_msl"),
+            *("altitude_above_sea_level", "altitude_above_mean_sea_level"),
+        ),
+        "ellipsoid": ("alt_ellipsoid", "altitude_ellipsoid", "ellipsoidal_height", "alt_hae", "hae"),
+        "unknown": ("alt", "altitude", "ele", "elevation"),
+    }
+)
+ALTITUDES: Final = MappingProxyType({name: of for of, names in _NAMES_OF_ALTITUDES.items() for name in names})
 
 _DATES: Final = ("date", "date_local", "date_utc", "gps_date")
 # Of several receivers or drones in one table, where the format names no such column; these may number lines as well.
@@ -97,6 +108,12 @@ class Format:
         For messages.
     signs : tuple of frozenset
         Names, all of one set, that tell the format: as names are compared, or as they are written.
+    altitudes : mapping
+        Name of an altitude -> what it counts from, as the format has it; others are looked for by common names.
+    epoch : tuple of str
+        Names of times that count from 1970, UTC.
+    gps : tuple of str
+        Names of dates and weeks that count without leap seconds.
     columns : mapping
         Field -> name -> unit; the first name that is there is read. None: it holds dates, or the unit is asked for.
         Fields that are missing here are looked for by their common names; those with no name are never there.
@@ -115,6 +132,9 @@ class Format:
     name: str = ""
     signs: tuple[frozenset[str], ...] = ()
     columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
+    altitudes: Mapping[str, AltitudeOf] = field(default_factory=dict)
+    epoch: tuple[str, ...] = ()
+    gps: tuple[str, ...] = ()
     counts: bool = False
     fix: Mapping[str, float] = field(default_factory=lambda: {"fix_type": 2.0})
     receiver: str = ""
@@ -131,7 +151,14 @@ PX4: Final = Format(
         ),
         frozenset({"timestamp", "latitude_deg", "longitude_deg", "altitude_msl_m"}),
     ),
-    columns={"time": {"timestamp": "us"}, "yaw": {"heading": "rad", "yaw": "rad"}, "pitch": {}, "roll": {}},
+    columns={
+        "time": {"timestamp": "us"},
+        "altitude": {"altitude_msl_m": "m", "alt": "mm"},
+        "yaw": {"heading": "rad", "yaw": "rad"},
+        "pitch": {},
+        "roll": {},
+    },
+    altitudes={"altitude_msl_m": "geoid", "alt": "geoid"},
     counts=True,
 )
 _ANY: Final = Format()
@@ -149,6 +176,7 @@ FORMATS: Final = (
                 "osd_fly_time": None,
             },
             "height": {"osd_height_m": "m", "osd_height_ft": "ft", "osd_height": None},
+            "altitude": {"osd_altitude_m": "m", "osd_altitude_ft": "ft"},
             "yaw": {"osd_yaw_360": "deg", "osd_yaw": "deg"},
             "pitch": {"osd_pitch": "deg"},
             "roll": {"osd_roll": "deg"},
@@ -166,10 +194,13 @@ FORMATS: Final = (
         columns={
             "time": {"time_boot_ms": "ms", "time_usec": "us", "timestamp": None},
             "height": {"relative_alt": "mm"},
+            "altitude": {"alt": "mm"},
             "yaw": {"hdg": "cdeg"},
             "pitch": {"attitude_pitch": "rad"},
             "roll": {"attitude_roll": "rad"},
         },
+        altitudes={"alt": "geoid"},
+        epoch=("time_usec",),
         counts=True,
         no_yaw=65535.0,
     ),
@@ -179,10 +210,12 @@ FORMATS: Final = (
         columns={
             "time": {"time_us": "us", "time_ms": "ms"},
             "height": {"rel_home_alt": "m", "rel_alt": "m"},
+            "altitude": {"alt": "m"},
             "yaw": {"yaw": "deg"},
             "pitch": {"pitch": "deg"},
             "roll": {"roll": "deg"},
         },
+        altitudes={"alt": "geoid"},
         counts=True,
         fix={"status": 2.0},
         receiver="i",
@@ -209,7 +242,12 @@ FORMATS: Final = (
             frozenset({"latitude_deg", "longitude_deg", "gpst"}),
             frozenset({"utc", "latitude_deg", "longitude_deg", "height_m"}),
         ),
-        columns={"time": {"gpst": None, "utc": None, "jst": None, "time": None}, "height": {}},
+        columns={
+            "time": {"gpst": None, "utc": None, "jst": None, "time": None},
+            "height": {},
+            "altitude": {"height_m": "m"},
+        },
+        gps=("gpst",),
         fix={"q": 1.0},
     ),
     Format(
@@ -220,7 +258,10 @@ FORMATS: Final = (
             "longitude": {"field_longitude": "deg"},
             "time": {"time": "ns", "field_header_stamp": "ns"},
             "height": {},
+            "altitude": {"field_altitude": "m"},
         },
+        altitudes={"field_altitude": "ellipsoid"},
+        epoch=("time", "field_header_stamp"),
         fix={"field_status_status": 0.0},
     ),
     Format(
@@ -231,6 +272,7 @@ FORMATS: Final = (
             "longitude": {"gpslongitude": "deg"},
             "time": {"sub_sec_date_time_original": None, "date_time_original": None},
             "height": {"relative_altitude": "m"},
+            "altitude": {"gpsaltitude": "m"},
             "yaw": {"flight_yaw_degree": "deg"},
             "pitch": {"flight_pitch_degree": "deg"},
             "roll": {"flight_roll_degree": "deg"},
@@ -257,6 +299,7 @@ class Layout:
     format: Format
     keys: tuple[str, ...]  # of all columns, without their topics
     fields: dict[str, Column]
+    altitude_of: AltitudeOf = "unknown"
     hemispheres: dict[str, Column] = field(default_factory=dict)  # of the sign of a latitude or longitude
     part: Column | None = None  # of a second, beside whole seconds
     date: Column | None = None
@@ -303,10 +346,13 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
     topic = _topic(found["latitude"])
     if log_format.no_yaw == 0 and "yaw" in found and not _is_yaw_of_gps(found["yaw"], short):
         log_format = replace(log_format, no_yaw=None)
+    fields = {name: column for name, column in found.items() if facts.unit(QUANTITIES[name]) != "none"}
+    altitude, altitude_of = _altitude(header, keys, log_format, topic)
     layout = Layout(
         format=log_format,
         keys=tuple(short),
-        fields={name: column for name, column in found.items() if facts.unit(QUANTITIES[name]) != "none"},
+        fields=fields if altitude is None else {**fields, "altitude": altitude},
+        altitude_of=altitude_of,
         date=_named(header, keys, _DATES),
         hemispheres=_hemispheres(header, short, log_format),
         part=part if facts.time_unit != "none" else None,
@@ -317,6 +363,29 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
     if "time" not in found and facts.time_unit != "none":
         _check_no_time(source, header, keys, layout)
     return layout
+
+
+def _altitude(
+    header: Sequence[str], keys: Sequence[tuple[str, str]], log_format: Format, topic: str | None
+) -> tuple[Column | None, AltitudeOf]:
+    """Return the column of altitudes and what they count from; none whose unit is open is read, nor one of two."""
+    if "altitude" in log_format.columns:
+        for name, unit in log_format.columns["altitude"].items():
+            places = [at for at, both in enumerate(keys) if name in both]
+            if places:
+                column = Column(at=places[0], name=header[places[0]], unit=unit)
+                return (column if len(places) == 1 else None), log_format.altitudes.get(name, "unknown")
+        return None, "unknown"
+    found: dict[AltitudeOf, list[Column]] = {"geoid": [], "ellipsoid": [], "unknown": []}
+    for at, both in enumerate(keys):
+        for name, unit in (_words_of(key, WORDS["height"]) for key in both):
+            if name in ALTITUDES and unit and _topic_of(header[at]) in (topic, ""):
+                found[ALTITUDES[name]].append(Column(at=at, name=header[at], unit=WORDS["height"][unit]))
+                break
+    for reference, columns in found.items():
+        if columns:
+            return (columns[0] if len(columns) == 1 else None), reference
+    return None, "unknown"
 
 
 def _check_meaning(
@@ -413,7 +482,8 @@ def unread(header: Sequence[str], layout: Layout, read: Collection[str], *, has_
     known = {column.at for name, column in layout.fields.items() if name in read}
     known |= {column.at for column in (*others, *layout.hemispheres.values()) if column is not None}
     left = [at for at, name in enumerate(header) if at not in known and name.strip()]
-    why = "; altitudes above the sea are no heights" if any(_is_altitude(layout.keys[at]) for at in left) else ""
+    is_altitude = any(_is_altitude(layout.keys[at]) for at in left)
+    why = "; an altitude is read if one column of them states its unit" if is_altitude else ""
     return (f"not read: {listed([header[at] for at in left])}{why}",) if left else ()
 
 

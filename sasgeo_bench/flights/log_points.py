@@ -6,13 +6,15 @@ import io
 import math
 import re
 import warnings
+import zipfile
+import zlib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Self
+from typing import Final, Literal, Self
 from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
@@ -27,6 +29,8 @@ from sasgeo_bench.core.texts import message_of, plain
 from sasgeo_bench.flights.log_units import FASTEST_MPS, HIGHEST_M
 
 Floats = NDArray[np.float64]
+# What an altitude counts from: the geoid, which is the sea; the ellipsoid of WGS 84; or what the file does not say.
+AltitudeOf = Literal["geoid", "ellipsoid", "unknown"]
 
 MOST_BYTES: Final = 64 * 2**20  # of a log
 MOST_POINTS: Final = 1_000_000
@@ -78,13 +82,14 @@ class LogSource:
             raise self.fault(message, number) from error
         return (moment if moment.tzinfo else moment.replace(tzinfo=dt.UTC)).timestamp()
 
-    def check_size(self) -> None:
-        """Raise `FlightError` if there is no such file, or if it is too large."""
+    def check_size(self, most: int | None = None) -> None:
+        """Raise `FlightError` if there is no such file, or if it is larger than so many bytes (64 MiB)."""
         if not self.path.is_file():
             raise FlightError(f"there is no flight log {self.path}: check the path")
         size = self.path.stat().st_size
-        if size > MOST_BYTES:
-            raise self.fault(f"{size} bytes, at most {MOST_BYTES} are read: cut the log first")
+        most = MOST_BYTES if most is None else most
+        if size > most:
+            raise self.fault(f"{size} bytes, at most {most} are read: cut the log first")
 
     def check_count(self, count: int) -> None:
         """Raise `FlightError` for more points than are read."""
@@ -101,9 +106,15 @@ class FlightLog:
     lon_deg, lat_deg : ndarray, shape (N,)
         WGS 84, degrees.
     time_s : ndarray, shape (N,), optional
-        Seconds since the first point, strictly increasing.
+        Seconds since `start_s`, strictly increasing.
+    start_s : float, optional
+        Seconds since 1970, UTC, at `time_s` 0; None where the file does not say its zone.
     height_m : ndarray, shape (N,), optional
         Height above the ground or the place of take-off, metres; never one above the sea.
+    altitude_m : ndarray, shape (N,), optional
+        Altitude, metres.
+    altitude_of : {"geoid", "ellipsoid", "unknown"}
+        What the altitude counts from: the geoid (the sea), the ellipsoid of WGS 84, or what the file does not say.
     yaw_deg, pitch_deg, roll_deg : ndarray, shape (N,), optional
         Attitude of the body, degrees, yaw from true north; in the order of angles of `sensing.camera.Attitude`.
     notes : tuple of str
@@ -113,7 +124,10 @@ class FlightLog:
     lon_deg: Floats
     lat_deg: Floats
     time_s: Floats | None = None
+    start_s: float | None = None
     height_m: Floats | None = None
+    altitude_m: Floats | None = None
+    altitude_of: AltitudeOf = "unknown"
     yaw_deg: Floats | None = None
     pitch_deg: Floats | None = None
     roll_deg: Floats | None = None
@@ -126,6 +140,8 @@ class FlightLog:
         numbers: Sequence[int],
         columns: Mapping[str, Floats],
         *,
+        start_s: float | None = None,
+        altitude_of: AltitudeOf = "unknown",
         notes: tuple[str, ...] = (),
         names: Mapping[str, str] = MappingProxyType({}),
     ) -> Self:
@@ -163,7 +179,9 @@ class FlightLog:
         return cls(
             lon_deg=columns["lon_deg"],
             lat_deg=columns["lat_deg"],
-            **{name: columns.get(name) for name in ("time_s", "height_m", *_ANGLES)},
+            **{name: columns.get(name) for name in ("time_s", "height_m", "altitude_m", *_ANGLES)},
+            start_s=start_s,
+            altitude_of=altitude_of,
             notes=notes,
         )
 
@@ -184,6 +202,32 @@ def shown(text: str) -> str:
     """
     line = plain(text.strip())
     return repr(line if len(line) <= _MOST_SHOWN else line[: _MOST_SHOWN - 3] + "...")
+
+
+def altitude_note(altitude_of: AltitudeOf) -> str:
+    """Return the line on what altitudes count from.
+
+    >>> altitude_note("geoid")
+    'altitude: above the geoid (the sea), no height above the ground'
+    """
+    base = {
+        "geoid": "above the geoid (the sea)",
+        "ellipsoid": "above the ellipsoid of WGS 84",
+        "unknown": "of a reference that the file does not name",
+    }[altitude_of]
+    return f"altitude: {base}, no height above the ground"
+
+
+def has_offset(text: str) -> bool:
+    """Return whether a time in ISO 8601 names its zone.
+
+    >>> [has_offset(text) for text in ("2025-05-01T10:00:00Z", "2025-05-01T10:00:00+02:00", "2025-05-01T10:00:00")]
+    [True, True, False]
+    """
+    try:
+        return dt.datetime.fromisoformat(text.strip()).tzinfo is not None
+    except ValueError:
+        return False
 
 
 def listed(names: Sequence[str]) -> str:
@@ -252,7 +296,9 @@ _POINTS: Final = ("trkpt", "rtept")  # of a track and of a route
 _DEEPEST: Final = 64  # elements in each other
 _MOST_ELEMENTS: Final = 3_000_000  # of a file: others than tracks take the time of a million points at most
 _LONG_TAG: Final = re.compile(rb"<[^<>]{100000}")  # attributes without end take minutes
-_ABOVE_GROUND: Final = "relativeToGround"  # of KML's altitudes; the others count from the sea, or are none
+# Modes of KML's altitudes; the others are of the sea's floor, or of none.
+_ABOVE_GROUND: Final = "relativeToGround"
+_ABOVE_SEA: Final = "absolute"  # "vertical datum, i.e. WGS84 EGM96 geoid" (OGC KML 2.3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -264,10 +310,11 @@ class _Track:
     lat_deg: "array[float]" = field(default_factory=lambda: array("d"))
     moments: "array[float]" = field(default_factory=lambda: array("d"))
     heights_m: "array[float]" = field(default_factory=lambda: array("d"))
+    altitudes_m: "array[float]" = field(default_factory=lambda: array("d"))
     unread: list[str] = field(default_factory=list)
 
-    def log(self) -> FlightLog:
-        """Return the log; times are of all points or of none."""
+    def log(self, *, altitude_of: AltitudeOf, has_zone: bool = True) -> FlightLog:
+        """Return the log; times are of all points or of none, and so are altitudes."""
         count = len(self)
         if self.moments and len(self.moments) != count:
             raise self.source.fault(f"{len(self.moments)} of {count} points have a time: give each one, or none")
@@ -276,8 +323,21 @@ class _Track:
             columns["time_s"] = (np.array(self.moments) - self.moments[0]).round(6)
         if self.heights_m:
             columns["height_m"] = np.array(self.heights_m)
-        notes = (f"not read: {', '.join(self.unread)}",) if self.unread else ()
-        return FlightLog.of(self.source, range(1, count + 1), columns, notes=notes)
+        if self.altitudes_m:
+            altitude_m = np.array(self.altitudes_m)
+            if len(altitude_m) == count and np.isfinite(altitude_m).all():
+                columns["altitude_m"] = altitude_m
+            else:
+                self.leave("altitudes, which are not those of all points")
+        notes = (altitude_note(altitude_of),) if "altitude_m" in columns else ()
+        return FlightLog.of(
+            self.source,
+            range(1, count + 1),
+            columns,
+            start_s=self.moments[0] if self.moments and has_zone else None,
+            altitude_of=altitude_of,
+            notes=(*notes, *((f"not read: {', '.join(self.unread)}",) if self.unread else ())),
+        )
 
     def leave(self, what: str) -> None:
         """Note what is not read, once."""
@@ -291,7 +351,8 @@ class _Track:
 def read_gpx(path: Path) -> FlightLog:
     """Read the track of a GPX file, or its route where it has no track; raise `FlightError` if it is not sound.
 
-    Segments of the track follow each other. Elevations are above the sea, and are not read.
+    Segments of the track follow each other. Times are UTC, as GPX has them. Elevations are altitudes: the format does
+    not say from which sea, and phones write both.
     """
     track, route = _Track(source=LogSource(path=path)), _Track(source=LogSource(path=path))
     counts = Counter[str]()
@@ -303,21 +364,22 @@ def read_gpx(path: Path) -> FlightLog:
         elif event == "end" and name == "time" and parent in _POINTS:
             _add_time(track if parent == _POINTS[0] else route, element.text)
         elif event == "end" and name == "ele" and parent in _POINTS:
-            (track if parent == _POINTS[0] else route).leave("elevations, which are above the sea")
+            _add_altitude(track if parent == _POINTS[0] else route, element.text)
     kind, read = ("trk", track) if len(track) or not len(route) else ("rte", route)
     if counts[kind] > 1:
         raise track.source.fault(f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant")
-    return read.log()
+    return read.log(altitude_of="unknown")
 
 
 def read_kml(path: Path) -> FlightLog:
-    """Read the one line or track of a KML file; raise `FlightError` if it is not sound.
+    """Read the one line or track of a KML file or of a KMZ's; raise `FlightError` if it is not sound.
 
-    A `LineString` has no times, a `gx:Track` has. Altitudes are heights where they are relative to the ground; others
-    are not read, nor are angles.
+    A `LineString` has no times, a `gx:Track` has. Altitudes are heights where they are relative to the ground, and
+    count from the geoid where they are absolute; others are not read, nor are angles.
     """
     source = LogSource(path=path)
     lines: list[_Track] = []
+    has_zone = True
     opened = ""  # times and places of other elements are not of the line
     texts: dict[str, str] = {}
     for event, element, parent in _elements(source):
@@ -331,6 +393,7 @@ def read_kml(path: Path) -> FlightLog:
         elif parent == opened and name in ("altitudeMode", "coordinates"):
             texts[name] = text
         elif parent == opened and name in ("when", "coord"):
+            has_zone &= name != "when" or has_offset(text)
             _add(lines[-1], name, text)
         elif parent == opened and name == "angles":
             lines[-1].leave("angles")
@@ -339,7 +402,7 @@ def read_kml(path: Path) -> FlightLog:
             opened = ""
     if len(lines) != 1:
         raise source.fault(f"{len(lines)} lines or tracks, one is read: keep the one that is meant")
-    return lines[0].log()
+    return lines[0].log(altitude_of="geoid", has_zone=has_zone)
 
 
 def _add(line: _Track, name: str, text: str) -> None:
@@ -351,12 +414,14 @@ def _add(line: _Track, name: str, text: str) -> None:
 
 
 def _close(line: _Track, coordinates: str, mode: str) -> None:
-    """Read the points of a LineString; keep heights if all points have one, above the ground."""
+    """Read the points of a LineString; keep heights if all points have one, above the ground or the sea."""
     for place in coordinates.split():
         _add_place(line, place.split(","))
     if mode != _ABOVE_GROUND or len(line.heights_m) != len(line):
-        if line.heights_m:
-            why = "not relative to the ground" if mode != _ABOVE_GROUND else "not those of all points"
+        if mode == _ABOVE_SEA:
+            line.altitudes_m.extend(line.heights_m)
+        elif line.heights_m:
+            why = "not those of all points" if mode == _ABOVE_GROUND else "neither relative to the ground nor absolute"
             line.leave(f"altitudes, which are {why}")
         del line.heights_m[:]
 
@@ -365,6 +430,14 @@ def _add_time(line: _Track, text: str | None) -> None:
     number = len(line.moments) + 1
     line.source.check_count(number)
     line.moments.append(line.source.moment(text, number))
+
+
+def _add_altitude(line: _Track, text: str | None) -> None:
+    """Add the altitude of the point that is open; one that is no number is none of that point."""
+    try:
+        line.altitudes_m.append(float(text or "nan"))
+    except ValueError:
+        line.altitudes_m.append(math.nan)
 
 
 def _add_place(line: _Track, parts: Sequence[str | None]) -> None:
@@ -417,9 +490,27 @@ def _content(source: LogSource) -> bytes:
         content = plain_file(source.path).read_bytes()
     except OSError as error:
         raise source.fault(f"cannot be read ({message_of(error)}): check its rights") from error
+    if source.path.suffix.lower() == ".kmz":
+        content = _unzipped(source, content)
     if _LONG_TAG.search(content):
         raise source.fault("a tag has more than 100000 characters: export it anew")
     return content
+
+
+def _unzipped(source: LogSource, content: bytes) -> bytes:
+    """Return the KML of a KMZ: the first in its root (OGC KML 2.3, annex C), of `MOST_BYTES` at most."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith(".kml") and "/" not in name]
+            if not names:
+                raise source.fault("holds no KML in its root: export it anew")
+            with archive.open(names[0]) as file:
+                unzipped = file.read(MOST_BYTES + 1)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, zlib.error) as error:
+        raise source.fault(f"no sound KMZ ({message_of(error)}): export it anew") from error
+    if len(unzipped) > MOST_BYTES:
+        raise source.fault(f"more than {MOST_BYTES} bytes unpacked: keep the track alone")
+    return unzipped
 
 
 def _name(element: Element) -> str:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.texts import message_of, plain
+from sasgeo_bench.flights.leap_seconds import GPS_EPOCH_S, WEEK_S, utc_of_gps
 from sasgeo_bench.flights.log_formats import (
     NUMBERING,
     PX4,
@@ -32,16 +33,24 @@ from sasgeo_bench.flights.log_formats import (
     key_of,
     unread,
 )
-from sasgeo_bench.flights.log_points import BEFORE_FIX, FlightLog, LogSource, shown, tell_left_out
+from sasgeo_bench.flights.log_points import (
+    BEFORE_FIX,
+    FlightLog,
+    LogSource,
+    altitude_note,
+    shown,
+    tell_left_out,
+)
 from sasgeo_bench.flights.log_units import UNITS, WORDS, LogFacts, choices_of
 
 _DAY_S: Final = 86_400.0
-_WEEK_S: Final = 604_800.0
 _YEAR_FIRST: Final = re.compile(r"(\d{4})[-/:.](\d{1,2})[-/:.](\d{1,2})[ T]+(\d{1,2})(:.+)")
 _DAY_TIME: Final = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)\s*(?:([AaPp])\.?\s?[Mm]\.?)?Z?")
 _WEEK: Final = re.compile(r"(\d{3,4}) +(\d+(?:\.\d+)?)")
 _SPAN: Final = re.compile(r"(?:(\d+)h\s*)?(?:(\d+)m\s*)?(\d+(?:\.\d+)?)s")
 _ZONE: Final = re.compile(r"\s*(?:UTC|GMT)(?=[-+]|$)")  # which a time is in without a word, too
+_ZONED: Final = re.compile(r"Z$|UTC|GMT|:\d\d(?:[.,]\d+)?\s*[-+]\d\d:?\d\d$")
+_DATED: Final = re.compile(r"\d{4}\D?\d{1,2}\D?\d{1,2}[T ]")  # of a moment, not a time of day
 _DATE: Final = re.compile(r"\d[-/.:]\d+[-/.:]\d|\dT\d")  # of a time that is no number, in any order
 
 
@@ -68,7 +77,7 @@ class Clock:
         if match := _DAY_TIME.fullmatch(text):
             return self._of_day(match, date.strip(), number)
         if match := _WEEK.fullmatch(text):
-            return int(match[1]) * _WEEK_S + float(match[2])
+            return int(match[1]) * WEEK_S + float(match[2])
         if match := _SPAN.fullmatch(text):
             return int(match[1] or 0) * 3600 + int(match[2] or 0) * 60 + float(match[3])
         if match := _YEAR_FIRST.fullmatch(text):
@@ -227,6 +236,7 @@ class _Table:
     numbers: "array[int]" = field(default_factory=lambda: array("q"))
     values: "dict[str, array[float]]"
     has_dates: bool = False
+    first_time: str = ""
 
 
 def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
@@ -234,7 +244,7 @@ def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
 
     The separator is a comma, a semicolon or a tab, or what a first line such as "sep=;" says. Decimals have a comma
     where the separator is none. Empty lines, and lines that begin with "#", are skipped; a line of units below the
-    header belongs to the names. Altitudes above the sea or the ellipsoid are no heights, and are not read.
+    header belongs to the names. Altitudes above the sea or the ellipsoid are no heights.
 
     Raises
     ------
@@ -262,16 +272,28 @@ def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
     numbers = np.array(table.numbers)
     layout = layout if table.has_dates else _as_px4(layout, values)
     numbers, values = _known(source, layout.format, numbers, values)
+    values = _with_altitude(layout, values)
+    whole = values.get("time", np.empty(0))[:1]
     values = _with_parts(source, layout, values, in_seconds=table.has_dates or facts.time_unit == "s")
+    start_s = _start_s(layout, whole, values, table)
     columns, notes = _converted(source, layout, facts, values, has_dates=table.has_dates)
     if not layout.format.is_sorted and "time_s" in columns:
         order = np.argsort(columns["time_s"], kind="stable")
         numbers, columns = numbers[order], {name: column[order] for name, column in columns.items()}
+        start_s = None if start_s is None else start_s + float(columns["time_s"][0])
         columns["time_s"] = columns["time_s"] - columns["time_s"][:1]
     lines_of = {line.partition(":")[0]: line.replace(": ", ", column ", 1) + "," for line in notes}
     names = {{"height": "height_m"}.get(name, f"{name}_deg"): line for name, line in lines_of.items()}
     notes += unread(lines.header, layout, values, has_dates=table.has_dates)
-    return FlightLog.of(source, numbers.tolist(), columns, notes=notes, names=names)
+    return FlightLog.of(
+        source,
+        numbers.tolist(),
+        columns,
+        start_s=start_s,
+        altitude_of=layout.altitude_of,
+        notes=notes,
+        names=names,
+    )
 
 
 # Values
@@ -285,7 +307,7 @@ def _read(source: LogSource, layout: Layout, lines: Lines) -> _Table:
     time = layout.fields.get("time")
     # The first point tells.
     has_dates: bool | None = False if time is None or time.unit is not None else None
-    decimal = ""
+    decimal = first_time = ""
     for number, cells in rows:
         row = _trimmed(source, cells, len(lines.header), number)
         if not gate.lets(row):
@@ -295,15 +317,13 @@ def _read(source: LogSource, layout: Layout, lines: Lines) -> _Table:
         places = [row[layout.fields[name].at] for name in ("latitude", "longitude")]
         decimal = decimal or ("," if any("," in text for text in places) else ".")
         if has_dates is None and time is not None:
-            has_dates = is_clock(row[time.at])
+            has_dates, first_time = is_clock(row[time.at]), row[time.at]
         for name, column in layout.fields.items():
             text = row[column.at]
             if name == "time" and has_dates:
                 value = clock.seconds(text, row[layout.date.at] if layout.date else "", number)
-            elif name in _MAY_LACK and _is_unknown(text):
-                value = math.nan
             else:
-                value = _number(source, text, name, number, decimal)
+                value = _value(source, text, name, number, decimal)
             if name in _SIGNS:
                 value *= _sign(source, layout, row, name, number, value)
             table.values[name].append(value)
@@ -311,7 +331,7 @@ def _read(source: LogSource, layout: Layout, lines: Lines) -> _Table:
             table.values["part"].append(_number(source, row[layout.part.at], layout.part.name, number, decimal))
     for which, count in gate.left.items():
         tell_left_out(source, count, which)
-    return replace(table, has_dates=bool(has_dates))
+    return replace(table, has_dates=bool(has_dates), first_time=first_time)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -346,6 +366,53 @@ class _Gate:
             if cell != self.receiver:
                 return f"of other receivers than {plain(receiver.name)} = {plain(self.receiver)}"
         return ""
+
+
+def _value(source: LogSource, text: str, name: str, number: int, decimal: str) -> float:
+    """Return the number in a cell; NaN where a height or an angle is unknown, or an altitude is no number."""
+    if name == "altitude":  # no place depends on it
+        try:
+            return float(text.replace(",", ".") if decimal == "," else text)
+        except ValueError:
+            return math.nan
+    if name in _MAY_LACK and _is_unknown(text):
+        return math.nan
+    return _number(source, text, name, number, decimal)
+
+
+def _with_altitude(layout: Layout, values: dict[str, Floats]) -> dict[str, Floats]:
+    """Return the values without altitudes where not all points have one, or their unit is open."""
+    altitude = values.get("altitude")
+    if altitude is None:
+        return values
+    # What is scaled of a message is scaled by its reader's taste; places of PX4 in degrees have altitudes in metres.
+    is_open = layout.format.counts and layout.fields["altitude"].unit == "mm" and not _is_count(values)
+    if np.isfinite(altitude).all() and is_open and layout.format is PX4:
+        return {**values, "altitude": altitude * 1e3}
+    if is_open or not np.isfinite(altitude).all():
+        return {name: column for name, column in values.items() if name != "altitude"}
+    return values
+
+
+def _start_s(layout: Layout, whole: Floats, values: dict[str, Floats], table: _Table) -> float | None:
+    """Return the first time in seconds since 1970, UTC; None if the file does not say in which zone it counts."""
+    time = layout.fields.get("time")
+    if time is None or not len(whole):
+        return None
+    # `whole` is the time before its parts of a second were added, and what was whole taken off
+    first, key, text = float(whole[0]), layout.keys[time.at], table.first_time.strip()
+    first += float(values["time"][0]) if values["time"][0] != first else 0.0
+    if not table.has_dates:
+        first *= UNITS["time"][time.unit or "s"]
+        # 1e9: a clock that has never been set counts from its start
+        return first if key in layout.format.epoch and first > 1e9 else None
+    if _WEEK.fullmatch(text):
+        return utc_of_gps(first)
+    if not _DATED.match(text):
+        return None
+    if key in layout.format.gps:
+        return utc_of_gps(first - GPS_EPOCH_S)
+    return first if _ZONED.search(text) or "utc" in key.split("_") else None
 
 
 def _trimmed(source: LogSource, cells: list[str], count: int, number: int) -> list[str]:
@@ -504,6 +571,10 @@ def _converted(
             _check_stated_unit(source, at, "dates", facts.time_unit, "time")
             columns["time_s"] = (column - column[:1]).round(6)
             notes.append(f"time: {shown(at.name)}, as dates or clocks have it")
+            continue
+        if name == "altitude":
+            columns["altitude_m"] = column * UNITS["height"][at.unit or "m"]
+            notes.append(f"{altitude_note(layout.altitude_of)} ({shown(at.name)}, {at.unit})")
             continue
         if quantity == "place":
             unit = _place_unit(source, at, facts, values, counts=counts)

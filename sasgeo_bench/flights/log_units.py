@@ -82,6 +82,8 @@ class LogFacts:
         Axes of a TUM file (`sasgeo_bench.flights.trajectory`).
     speed_mps : float, optional
         Even speed of a log without times, 0.1 to 100 m/s; by default 10 m/s.
+    vehicle : int, optional
+        System id of the vehicle in a telemetry log of several.
 
     Raises
     ------
@@ -95,6 +97,7 @@ class LogFacts:
     place_unit: PlaceUnit | None = None
     axes: Axes | None = None
     speed_mps: float | None = None
+    vehicle: int | None = None
 
     def __post_init__(self) -> None:
         for quantity in UNITS:

@@ -7,6 +7,7 @@ import math
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -18,8 +19,12 @@ from sasgeo_bench.core.errors import FlightError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
+from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
+from sasgeo_bench.flights.log_dataflash import read_dataflash
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
 from sasgeo_bench.flights.log_table import read_csv
+from sasgeo_bench.flights.log_telemetry import read_tlog
+from sasgeo_bench.flights.log_ulog import read_ulog
 from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum
@@ -30,10 +35,22 @@ from sasgeo_bench.regions.region import Region
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SUFFIXES: Final = (".gpx", ".kml", ".csv", ".pos", ".tum", ".txt", ".tum.gz", ".txt.gz")
+_TUM: Final = (".tum", ".txt", ".tum.gz", ".txt.gz")
+_READERS: Final = MappingProxyType(
+    {
+        ".gpx": read_gpx,
+        ".kml": read_kml,
+        ".kmz": read_kml,
+        ".ulg": read_ulog,
+        ".bin": read_dataflash,
+        ".log": read_dataflash,
+    }
+)
+_TABLES: Final = (".csv", ".pos")
+_TELEMETRY: Final = ".tlog"
+SUFFIXES: Final = (*_READERS, _TELEMETRY, *BAGS, *_TABLES, *_TUM)
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
-_TUM: Final = SUFFIXES[4:]
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
@@ -65,18 +82,19 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
 
 def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     suffix = path.suffix.lower()
-    is_table = suffix in (".csv", ".pos")
-    reader = {".gpx": read_gpx, ".kml": read_kml}.get(suffix)
-    if reader is None and not is_table:
-        mend = "unzip a .kmz, export a .ulg by ulog2csv of pyulog"
-        raise FlightError(f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are ({mend})")
+    reader = read_bag if is_bag(path) else _READERS.get(suffix)
+    is_table, is_telemetry = suffix in _TABLES, suffix == _TELEMETRY
+    if reader is None and not is_table and not is_telemetry:
+        raise FlightError(f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are")
     if facts.axes is not None:
         raise _meaningless(path, "is no TUM file", "--axes")
-    if reader is None:
+    if facts.vehicle is not None and not is_telemetry:
+        raise _meaningless(path, "is no telemetry log", "--vehicle")
+    if is_table:
         # What is not read has no unit to be asked for.
         return read_csv(path, replace(facts, height_unit="none") if has_height else facts)
     facts.check_untold(path)
-    return reader(path)
+    return read_tlog(path, vehicle=facts.vehicle) if reader is None else reader(path)
 
 
 def _meaningless(path: Path, why: str, option: str) -> FlightError:
@@ -228,8 +246,8 @@ def _on_grid(log: FlightLog, path: Path, epsg: int, speed_mps: float) -> Traject
     """Return the points of a log in a projected CRS; without a heading yaw is 0."""
     up_m = log.height_m
     if up_m is None:
-        why = "has no height above the ground, and altitudes above the sea are not read"
-        raise FlightError(f"{path.name} {why}: say one, as in --height-m 100")
+        why = "" if log.altitude_m is None else ", and its altitudes do not count from there"
+        raise FlightError(f"{path.name} has no height above the ground{why}: say one, as in --height-m 100")
     en_m = np.stack(from_lonlat(epsg).transform(log.lon_deg, log.lat_deg), axis=1)
     en_m = np.nan_to_num(en_m, nan=_FAR_M, posinf=_FAR_M, neginf=-_FAR_M)
     time_s = log.time_s

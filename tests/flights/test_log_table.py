@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of flight logs: units by names and formats, asked for where neither tells them, and never guessed."""
 
+import datetime as dt
 import math
 import warnings
 from collections.abc import Callable
@@ -315,3 +316,72 @@ def test_no_name_stands_for_two_fields_and_every_unit_has_a_factor() -> None:
     for one in FORMATS:
         for field, columns in one.columns.items():
             assert set(columns.values()) - {None} <= set(UNITS[QUANTITIES[field]])
+
+
+# When it starts, and altitudes
+
+
+NOON_S = dt.datetime(2025, 5, 1, 12, tzinfo=dt.UTC).timestamp()
+WEEK, WEEK_S = 2364, 4 * 86_400 + 43_218  # of GPS, 18 s ahead of noon
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "start_s"),
+    [
+        ("time,lat,lon", lambda y, x, s: f"2025-05-01T12:00:0{s}Z,{y},{x}", NOON_S),
+        ("time,lat,lon", lambda y, x, s: f"2025-05-01T14:00:0{s}+02:00,{y},{x}", NOON_S),
+        ("time,lat,lon", lambda y, x, s: f"2025-05-01 12:00:0{s} UTC,{y},{x}", NOON_S),
+        ("datetime(utc),lat,lon", lambda y, x, s: f"2025-05-01 12:00:0{s},{y},{x}", NOON_S),
+        ("time,lat,lon", lambda y, x, s: f"2025-05-01 12:00:0{s},{y},{x}", None),  # of no zone
+        ("time_utc,lat,lon", lambda y, x, s: f"12:00:0{s},{y},{x}", None),  # of no day
+        ("time_s,lat,lon", lambda y, x, s: f"{NOON_S + s},{y},{x}", None),  # of no origin
+        (ROS, lambda y, x, s: f"{int(NOON_S + s)}250000000,1,2,0,{y},{x},500", NOON_S + 0.25),
+        (ROS, lambda y, x, s: f"{s}250000000,1,2,0,{y},{x},500", None),  # of a simulator
+        ("GPST,latitude(deg),longitude(deg),height(m),Q,ns", lambda y, x, s:
+         f"2025/05/01 12:00:{18 + s}.000,{y},{x},500,1,9", NOON_S),
+        ("UTC,latitude(deg),longitude(deg),height(m),Q,ns", lambda y, x, s:
+         f"2025/05/01 12:00:0{s}.000,{y},{x},500,1,9", NOON_S),
+        ("GPST,latitude(deg),longitude(deg),height(m),Q,ns", lambda y, x, s:
+         f"{WEEK} {WEEK_S + s}.000,{y},{x},500,1,9", NOON_S),
+        ("time_usec,fix_type,lat,lon,alt", lambda y, x, s:
+         f"{int(NOON_S + s)}000000,3,{_e7(y)},{_e7(x)},500000", NOON_S),
+        ("time_usec,fix_type,lat,lon,alt", lambda y, x, s: f"{s}000000,3,{_e7(y)},{_e7(x)},500000", None),
+        ("time_utc,ms,lat,lon", lambda y, x, s: f"2025-05-01T12:00:0{s},250,{y},{x}", NOON_S + 0.25),
+    ],
+)  # fmt: skip
+def test_a_log_starts_at_a_moment_where_its_file_says_in_which_zone(
+    tmp_path: Path, head: str, row: Row, start_s: float | None
+) -> None:
+    log = _read(tmp_path, head, row)
+    assert log.time_s == pytest.approx([0, 1, 2, 3, 4, 5])
+    assert log.start_s == (None if start_s is None else pytest.approx(start_s, abs=1e-3))
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "altitude_m", "altitude_of"),
+    [
+        (f"{PLAIN},alt_m", lambda y, x, s: f"{s},{y},{x},480.5", 480.5, "unknown"),
+        (f"{PLAIN},altitude(feet),altitude_amsl_ft", lambda y, x, s: f"{s},{y},{x},9,1000", 304.8, "geoid"),
+        (f"{PLAIN},alt_ellipsoid_mm", lambda y, x, s: f"{s},{y},{x},527500", 527.5, "ellipsoid"),
+        (f"{PLAIN},alt", lambda y, x, s: f"{s},{y},{x},480", None, "unknown"),  # of no unit
+        (f"{PLAIN},alt_m,elevation_m", lambda y, x, s: f"{s},{y},{x},480,470", None, "unknown"),  # of two meanings
+        (f"{PLAIN},alt_m", lambda y, x, s: f"{s},{y},{x}," + ("" if s == 3 else "480"), None, "unknown"),
+        (ROS, lambda y, x, s: f"{s}000000000,1,2,0,{y},{x},527.5", 527.5, "ellipsoid"),
+        ("time_boot_ms,lat,lon,alt,relative_alt,hdg", lambda y, x, s: f"{s}000,{_e7(y)},{_e7(x)},480500,80000,9000",
+         480.5, "geoid"),
+        ("timestamp,latitude_deg,longitude_deg,altitude_msl_m", lambda y, x, s: f"{s}000000,{y},{x},480.5",
+         480.5, "geoid"),
+        ("timestamp,lat,lon,alt,alt_ellipsoid", lambda y, x, s: f"{s}000000,{_e7(y)},{_e7(x)},480500,527500",
+         480.5, "geoid"),
+        ("timestamp,lat,lon,alt,terrain_alt", lambda y, x, s: f"{s}000000,{y},{x},480.5,400", 480.5, "geoid"),
+        ("TimeUS,Lat,Lng,Alt,RelHomeAlt", lambda y, x, s: f"{s}000000,{y},{x},480.5,80", 480.5, "geoid"),
+    ],
+)  # fmt: skip
+def test_altitudes_are_apart_from_heights_and_say_what_they_count_from(
+    tmp_path: Path, head: str, row: Row, altitude_m: float | None, altitude_of: str
+) -> None:
+    log = _read(tmp_path, head, row)
+    assert log.altitude_of == altitude_of
+    assert log.altitude_m == (None if altitude_m is None else pytest.approx(altitude_m))
+    assert log.height_m is None or log.height_m == pytest.approx(80)
+    assert len(log) == 6  # none is left out for want of an altitude

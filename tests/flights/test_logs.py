@@ -3,6 +3,9 @@
 
 import datetime as dt
 import gzip
+import io
+import sys
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +17,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights import log_points
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import read_flight, read_log
@@ -104,11 +107,16 @@ def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(written, mod
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [
-        ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>"), "elevations, which are above the sea"),
-        ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"), "altitudes, which are not relative to the ground"),
+        ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>", 3),
+         "altitudes, which are not those of all points"),
+        ("b.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>").replace("480", "-.-", 1),
+         "altitudes, which are not those of all points"),
+        ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"),
+         "altitudes, which are neither relative to the ground nor absolute"),
         ("a.csv", "lat,lon,height_furlong,heading_mil\n1,1,2,3\n1,2,2,3", "'height_furlong', 'heading_mil'"),
-        ("b.csv", "lat,lon,date,altitude_m,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
-         "'date', 'altitude_m'; altitudes above"),
+        ("b.csv", "lat,lon,date,altitude,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
+         "'date', 'altitude'; an altitude is read if one column of them states its unit"),
+        ("e.csv", "lat,lon,altitude_m,time_s,\n1,1,2,1,\n1,1.00001,,3,", "'altitude_m'; an altitude is read if"),
         ("c.csv", "lat,lon,pitch_deg,\x1b[31m\n1,1,2,3\n1,2,2,3", "'pitch_deg', '?[31m'"),
         ("d.csv", "lat,lon," + ",".join(f"c{at:0>99}" for at in range(99)), "'c000"),
     ],
@@ -137,6 +145,36 @@ def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(writt
     )
     log = read_log(written("a.kml", text))
     assert (log.time_s.tolist(), log.height_m.tolist()) == ([0, 1, 2], [60, 60, 60])
+    assert (log.start_s, log.altitude_m) == (START.timestamp(), None)
+    above_sea = read_log(written("b.kml", text.replace("relativeToGround", "absolute").replace("Z</when>", "</when>")))
+    assert (above_sea.altitude_m.tolist(), above_sea.altitude_of) == ([60, 60, 60], "geoid")
+    assert (above_sea.height_m, above_sea.start_s) == (None, None)  # a time without a zone
+
+
+def test_a_kmz_is_the_kml_in_its_root(written: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    line = LINE.format("9.52,47.14,80 9.53,47.15,90")
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("files/other.kml", "<kml/>")
+        archive.writestr("doc.kml", line)
+    path = tmp_path / "a.KMZ"
+    path.write_bytes(packed.getvalue())
+    assert read_log(path).lat_deg.tolist() == read_log(written("a.kml", line)).lat_deg.tolist()
+    with monkeypatch.context() as patch:
+        patch.setattr(log_points, "MOST_BYTES", 10_000)
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("doc.kml", line + " " * 99_999)
+        assert "bytes unpacked: keep the track alone" in _refused(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("files/other.kml", line)
+    assert "holds no KML in its root" in _refused(path)
+
+
+def test_a_gpx_track_starts_in_utc_and_does_not_say_which_sea_its_elevations_count_from(written: Callable) -> None:
+    log = read_log(written("a.gpx", _gpx(_points()).replace("<time>", "<ele>480.5</ele><time>")))
+    assert (log.start_s, log.altitude_m.tolist(), log.altitude_of) == (START.timestamp(), [480.5] * 5, "unknown")
+    bare = read_log(written("b.gpx", _gpx(_points(), times=False)))
+    assert (bare.start_s, bare.altitude_m, bare.height_m) == (None, None, None)
 
 
 @pytest.mark.parametrize(
@@ -220,8 +258,8 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(wri
         ("a.kml", LINE.format("9,47 9,48").replace("</Document>", "<LineString/></Document>"), "2 lines or tracks"),
         ("a.kml", LINE.format("9.52, 47.14"), "point 1: longitude is no number|latitude is missing|is no longitude"),
         ("a.kml", LINE.format("9.52 47.14"), "point 1: '9.52' is no longitude, latitude and altitude"),
-        ("a.kmz", "PK",
-         r"no flight log that is read: .gpx, .kml, .csv, .pos, .tum, .*\(unzip a .kmz, export a .ulg by ulog2csv"),
+        ("a.kmz", "PK", "no sound KMZ"),
+        ("a.zip", "PK", "no flight log that is read: .gpx, .kml, .kmz, .ulg, .*.csv, .pos, .tum, .txt, .*gz are"),
     ],
 )  # fmt: skip
 def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(written, name, text, match) -> None:
@@ -364,7 +402,7 @@ def test_heights_come_from_the_log_or_are_given(written: Callable, region: Regio
     assert np.unique(read_flight(with_heights, region).position_m[:, 2]).tolist() == [70]
     assert np.unique(read_flight(with_heights, region, height_m=90.0).position_m[:, 2]).tolist() == [90]
     without = written("b.csv", _table(region, _across(region), more=",alt", cells=",470"))
-    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground, .*: say one, as in --height-m 100"):
+    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground: say one, as in --height-m 100"):
         read_flight(without, region)
 
 
@@ -432,3 +470,19 @@ def test_wishes_that_cannot_be_are_refused(written: Callable, region: Region, wi
     path = written("a.csv", _table(region, _across(region)))
     with pytest.raises(FlightError, match=next(iter(wish)).replace("_m", "-m")):
         read_flight(path, region, **({"height_m": 100.0} | wish))
+
+
+# Autopilots
+
+
+@pytest.mark.parametrize(
+    ("name", "library"), [("a.ulg", "pyulog"), ("a.bin", "pymavlink"), ("a.tlog", "pymavlink"), ("a.bag", "rosbags")]
+)
+def test_a_log_whose_library_is_not_installed_names_the_extra(
+    written: Callable, monkeypatch: pytest.MonkeyPatch, name: str, library: str
+) -> None:
+    for module in [one for one in sys.modules if one.partition(".")[0] == library]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ConfigError, match=rf"needs the package {library}: pip install 'sasgeo-bench\[logs\]'"):
+        read_log(written(name, ""))

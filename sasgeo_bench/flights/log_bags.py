@@ -1,0 +1,348 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags of ROS 1 and 2 and MCAP files of ROS 2, with the message types that a bag brings along.
+
+Which topic is read. Of PX4's own messages (`px4_msgs`) those that a ULog has, as `log_ulog` reads them. Otherwise the
+`NavSatFix` or `LocationFix` with the most fixes; topics that an estimator writes, as their names tell, and
+`geographic_msgs` only where there is no other. Heights are those of mavros above home (`rel_alt`), attitudes those of
+its `imu/data`. Times are the stamps of the headers, else those of the recorder.
+"""
+
+from array import array
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from operator import attrgetter
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.paths import plain_file
+from sasgeo_bench.flights import log_ulog
+from sasgeo_bench.flights.log_points import FlightLog, LogSource
+from sasgeo_bench.flights.log_streams import (
+    MOST_LOG_BYTES,
+    Clock,
+    Fixes,
+    Stream,
+    Streams,
+    first_with_fixes,
+    flight_of,
+    known_fields,
+    library,
+    quaternions_of_enu,
+)
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
+
+Floats = NDArray[np.float64]
+
+BAGS: Final = (".bag", ".mcap", ".db3")  # and folders
+METADATA: Final = "metadata.yaml"  # of the folder of a bag of ROS 2
+
+_EPOCH_NS: Final = 10**18  # clocks of a simulator begin at 0 and never come there
+_NS: Final = 1e9
+_PX4: Final = "px4_msgs/msg/"
+# Types of PX4's messages -> topic of a ULog.
+_OF_PX4: Final = MappingProxyType(
+    {
+        f"{_PX4}VehicleGpsPosition": "vehicle_gps_position",
+        f"{_PX4}SensorGps": "sensor_gps",
+        f"{_PX4}VehicleGlobalPosition": "vehicle_global_position",
+        f"{_PX4}VehicleLocalPosition": "vehicle_local_position",
+        f"{_PX4}HomePosition": "home_position",
+        f"{_PX4}VehicleLandDetected": "vehicle_land_detected",
+        f"{_PX4}VehicleAttitude": "vehicle_attitude",
+        f"{_PX4}VehicleOdometry": "vehicle_odometry",
+        f"{_PX4}EstimatorStatusFlags": "estimator_status_flags",
+        f"{_PX4}EstimatorStatus": "estimator_status",
+    }
+)
+_FIX: Final = "sensor_msgs/msg/NavSatFix"
+_LOCATION: Final = "foxglove_msgs/msg/LocationFix"
+# Types of places that are an estimator's -> path to what has latitude, longitude and altitude above the ellipsoid.
+_GEOGRAPHIC: Final = MappingProxyType(
+    {
+        "geographic_msgs/msg/GeoPointStamped": "position",
+        "geographic_msgs/msg/GeoPoseStamped": "pose.position",
+        "geographic_msgs/msg/GeoPoseWithCovarianceStamped": "pose.pose.position",
+    }
+)
+# Ends of topics that mavros and robot_localization write what they fused into.
+_FUSED: Final = ("global_position/global", "gps/filtered")
+_HEIGHT: Final = ("std_msgs/msg/Float64", "global_position/rel_alt")
+_TURNS: Final = ("sensor_msgs/msg/Imu", "imu/data")
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a bag: a file by its suffix, or the folder of a bag of ROS 2."""
+    return path.suffix.lower() in BAGS or (path / METADATA).is_file()
+
+
+def read_bag(path: Path) -> FlightLog:
+    """Read the flight of a bag.
+
+    Parameters
+    ----------
+    path : Path
+        `.bag` of ROS 1; `.mcap`, `.db3` or the folder of a bag of ROS 2.
+
+    Returns
+    -------
+    FlightLog
+        Its first note says which topic the places are from.
+
+    Raises
+    ------
+    ConfigError
+        If rosbags is not installed.
+    FlightError
+        If the bag has no places, or is damaged: one that was cut off has no index, and its own tool makes it anew.
+    """
+    with _opened(path) as bag, known_fields(bag.source):
+        topics = _px4_topics(bag, log_ulog.TOPICS)
+        has_px4 = any(topic in log_ulog.PLACES for topic, _ in topics.topics)
+        streams = log_ulog.streams_of(topics) if has_px4 else _ros_streams(bag)
+    return flight_of(bag.source, streams)
+
+
+def read_topics(path: Path, names: Collection[str]) -> log_ulog.Topics:
+    """Read PX4's own messages of a bag, as `log_ulog.read_topics` reads a ULog; raise as `read_bag` does."""
+    with _opened(path) as bag:
+        return _px4_topics(bag, names)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator["_Bag"]:
+    try:
+        from rosbags.highlevel import AnyReader  # noqa: PLC0415 - only where it is installed
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigError("a bag needs the package rosbags: pip install 'sasgeo-bench[logs]'") from error
+    source = LogSource(path=path, unit="fix")
+    if not path.is_dir():
+        source.check_size(MOST_LOG_BYTES)
+        plain_file(path)
+    with ExitStack() as stack:
+        with library(source, _FAULTS, mend=_MEND):
+            reader = stack.enter_context(AnyReader([path], default_typestore=get_typestore(Stores.LATEST)))
+        yield _Bag(source=source, reader=reader)
+
+
+_FAULTS: Final = (Exception,)  # asserts and errors of each storage and of every type
+_MEND: Final = (
+    "mend a bag that was cut off by `rosbag reindex`, `ros2 bag reindex` or `mcap recover`; an MCAP without ROS 2 "
+    "(protobuf, JSON) is not read"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bag:
+    """A bag that is open."""
+
+    source: LogSource
+    reader: "AnyReader"
+
+    def connections(self, kinds: Collection[str]) -> list["Connection"]:
+        """Return connections of some types that have messages, in the order of their topics."""
+        found = [one for one in self.reader.connections if one.msgtype in kinds and one.msgcount]
+        return sorted(found, key=lambda one: one.topic)
+
+    def table(self, connection: "Connection", paths: Sequence[str]) -> "_Table":
+        """Return the messages of a topic, with the values at some paths of attributes; arrays there are spread."""
+        recorded, stamps, values = array("q"), array("q"), array("d")
+        getters = [attrgetter(path) for path in paths]
+        width = 0
+        with library(self.source, _FAULTS, mend=_MEND):
+            for one, recorded_ns, data in self.reader.messages([connection]):
+                message = self.reader.deserialize(data, one.msgtype)
+                recorded.append(recorded_ns)
+                stamps.append(_stamp_ns(message))
+                row = [value for get in getters for value in np.ravel(get(message)).tolist()]
+                width = len(row)
+                values.extend(row)
+        return _Table(
+            name=connection.topic,
+            recorded_ns=np.array(recorded, dtype=np.int64),
+            stamps_ns=np.array(stamps, dtype=np.int64),
+            values=np.array(values).reshape(len(recorded), width),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Table:
+    """Messages of one topic, in the order of the bag.
+
+    `stamps_ns` are those of their headers, 0 where they have none.
+    """
+
+    name: str
+    recorded_ns: NDArray[np.int64]
+    stamps_ns: NDArray[np.int64]
+    values: Floats
+
+    @property
+    def is_stamped(self) -> bool:
+        """Return whether every header has its time."""
+        return bool((self.stamps_ns > 0).all())
+
+
+def _stamp_ns(message: Any) -> int:  # noqa: ANN401 - of a type that the bag brings along
+    stamp: Any = message.header.stamp if hasattr(message, "header") else getattr(message, "timestamp", 0)
+    return int(stamp.sec * 10**9 + stamp.nanosec) if hasattr(stamp, "nanosec") else 0
+
+
+_Maker = Callable[[LogSource, _Table, Floats], Fixes]
+
+
+# PX4
+
+
+def _px4_topics(bag: _Bag, names: Collection[str]) -> log_ulog.Topics:
+    """Return what PX4's own messages say, as topics of a ULog."""
+    topics: dict[tuple[str, int], Mapping[str, NDArray[Any]]] = {}
+    told: list[str] = []
+    for connection in bag.connections(_OF_PX4):
+        # of one type are the receiver that PX4 chose and any other, and poses of a camera and of the estimator
+        topic = next((one for one in names if connection.topic.endswith(f"/{one}")), _OF_PX4[connection.msgtype])
+        if topic not in names:
+            continue
+        number = sum(one == topic for one, _ in topics)
+        fields = [name for name, _ in bag.reader.typestore.fielddefs[connection.msgtype][1]]
+        kept = [name for name in fields if name in _NUMBERS]
+        table = bag.table(connection, kept)
+        topics[topic, number] = dict(zip(_spread(kept), table.values.T, strict=True))
+        told.append(f"{connection.topic} is {topic} {number}")
+    return log_ulog.Topics(source=bag.source, topics=topics, notes=(f"topics: {'; '.join(told)}",) if told else ())
+
+
+# Fields of PX4's messages that are read, by any of its versions.
+_NUMBERS: Final = frozenset(
+    {
+        *("timestamp", "time_utc_usec", "lat", "lon", "alt", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph"),
+        *("fix_type", "lat_lon_valid", "x", "y", "z", "xy_valid", "z_valid", "landed", "q", "position"),
+        *("control_mode_flags", *log_ulog.FUSING),
+    }
+)
+
+
+def _spread(names: Sequence[str]) -> list[str]:
+    """Return the names of columns, of which a quaternion has four and a place three."""
+    sizes = {"q": 4, "position": 3}
+    return [
+        column
+        for name in names
+        for column in ([f"{name}[{at}]" for at in range(sizes[name])] if name in sizes else [name])
+    ]
+
+
+# ROS
+
+
+def _ros_streams(bag: _Bag) -> Streams:
+    """Return what messages of ROS say."""
+    raw = [bag.table(one, _FIX_FIELDS) for one in bag.connections([_FIX])]
+    tables: list[tuple[_Table, _Maker]] = [(one, _fixes_of_ros) for one in raw if not one.name.endswith(_FUSED)]
+    tables += [(bag.table(one, _PLACE_FIELDS), _places_of_ros) for one in bag.connections([_LOCATION])]
+    tables.sort(key=lambda pair: -len(pair[0].recorded_ns))
+    fused: list[tuple[_Table, _Maker]] = [
+        (one, partial(_fixes_of_ros, is_estimate=True)) for one in raw if one.name.endswith(_FUSED)
+    ]
+    for one in bag.connections(_GEOGRAPHIC):
+        paths = [f"{_GEOGRAPHIC[one.msgtype]}.{name}" for name in _PLACE_FIELDS]
+        fused.append((bag.table(one, paths), partial(_places_of_ros, is_estimate=True)))
+    clocks = {table.name: _RosClock.of(table) for table, _ in (*tables, *fused)}
+    candidates = [make(bag.source, table, clocks[table.name].seconds(table)) for table, make in (*tables, *fused)]
+    fixes, notes = first_with_fixes(bag.source, candidates, f"NavSatFix, LocationFix, geographic_msgs or {_PX4[:-5]}")
+    clock = clocks[fixes.track.name]
+    return Streams(
+        fixes=fixes,
+        heights=_heights(bag, clock),
+        attitudes=_attitudes(bag, clock),
+        clock=clock.utc(fixes.track),
+        notes=(*notes, clock.note),
+    )
+
+
+_PLACE_FIELDS: Final = ("longitude", "latitude", "altitude")
+_FIX_FIELDS: Final = (*_PLACE_FIELDS, "status.status", "position_covariance_type", "position_covariance")
+
+
+def _fixes_of_ros(source: LogSource, table: _Table, time_s: Floats, *, is_estimate: bool = False) -> Fixes:
+    """Return the fixes of a NavSatFix: altitudes above the ellipsoid, no fix below 0."""
+    lon, lat, alt, status, kind, variance_m2, *_ = table.values.T
+    is_fix = status >= 0
+    stated_m2 = variance_m2[is_fix & (kind > 0) & (variance_m2 > 0)]
+    return Fixes.of(
+        source,
+        table.name,
+        time_s,
+        (lon, lat, alt),
+        is_fix,
+        altitude_of="ellipsoid",
+        is_estimate=is_estimate,
+        accuracy_m=float(np.sqrt(np.median(stated_m2))) if len(stated_m2) else np.nan,
+    )
+
+
+def _places_of_ros(source: LogSource, table: _Table, time_s: Floats, *, is_estimate: bool = False) -> Fixes:
+    lon, lat, alt = table.values.T
+    is_fix = np.ones(len(lon), dtype=bool)
+    return Fixes.of(
+        source, table.name, time_s, (lon, lat, alt), is_fix, altitude_of="ellipsoid", is_estimate=is_estimate
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _RosClock:
+    """The clock of the places: the stamps of their headers, or the recorder's."""
+
+    base_ns: int
+    late_ns: int  # by which the recorder is later, by the median
+    note: str
+
+    @classmethod
+    def of(cls, table: _Table) -> "_RosClock":
+        """Return the clock of a topic."""
+        if not table.is_stamped:
+            note = f"times: the recorder's, as {table.name} has none of its own"
+            return cls(base_ns=int(table.recorded_ns[0]), late_ns=0, note=note)
+        late_ns = int(np.median(table.recorded_ns - table.stamps_ns))
+        return cls(base_ns=int(table.stamps_ns[0]), late_ns=late_ns, note="times: stamps of headers")
+
+    def seconds(self, table: _Table) -> Floats:
+        """Return the times of a topic on this clock, seconds since the first place."""
+        own_ns = table.stamps_ns if table.is_stamped else table.recorded_ns - self.late_ns
+        return np.asarray((own_ns - self.base_ns) / _NS)
+
+    def utc(self, track: Stream) -> Clock | None:
+        """Return UTC, as the computer's clock had it; none of a simulator's."""
+        if self.base_ns < _EPOCH_NS:
+            return None
+        base_s = self.base_ns / _NS
+        return Clock(name="the computer's clock", time_s=track.time_s[:1], utc_s=base_s + track.time_s[:1])
+
+
+def _heights(bag: _Bag, clock: _RosClock) -> Stream | None:
+    """Return heights above home as mavros has them."""
+    for one in bag.connections([_HEIGHT[0]]):
+        if one.topic.endswith(_HEIGHT[1]):
+            table = bag.table(one, ["data"])
+            return Stream.of(bag.source, one.topic, clock.seconds(table), table.values)
+    return None
+
+
+def _attitudes(bag: _Bag, clock: _RosClock) -> Stream | None:
+    """Return attitudes of the vehicle as mavros has them; other inertial sensors have axes of their own."""
+    for one in bag.connections([_TURNS[0]]):
+        if one.topic.endswith(_TURNS[1]) and "mavros" in one.topic:
+            table = bag.table(one, [f"orientation.{name}" for name in "wxyz"])
+            turns = quaternions_of_enu(*table.values.T)
+            return Stream.of(bag.source, one.topic, clock.seconds(table), turns)
+    return None

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry out of logs: estimates of an autopilot that fused no receiver, beside what the receiver says.
+
+An estimate that fused GNSS is a copy of the truth, and no odometry: it is refused by name. What is left are the poses
+of a camera, and the estimator's own over stretches in which its flags say that no receiver was fused though it was
+logged.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sasgeo_bench.core.errors import FlightError, counted
+from sasgeo_bench.flights import log_bags, log_dataflash, log_ulog
+from sasgeo_bench.flights.drift import LOST_S, PairedRun, pair_run
+from sasgeo_bench.flights.log_points import LogSource
+from sasgeo_bench.flights.log_streams import (
+    NED_OF_ENU,
+    Estimate,
+    Fixes,
+    Stream,
+    known_fields,
+    turned_at,
+)
+from sasgeo_bench.flights.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
+
+SUFFIXES: Final = (".ulg", ".bin", ".log")  # and bags of PX4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoggedRuns:
+    """Runs of the odometry of one log against its receiver.
+
+    Parameters
+    ----------
+    runs : tuple of PairedRun
+        One for each stretch, all of one sequence, the log.
+    has_yaw : bool
+        Whether the odometry has headings of its own. Otherwise it is turned as the vehicle is, by its compass, so that
+        errors of heading are none, and those of position count along true north.
+    accuracy_m : float
+        Median of the horizontal accuracy that the receiver states, metres, which shortest segments measure; NaN where
+        it states none.
+    notes : tuple of str
+        What was read.
+    """
+
+    runs: tuple[PairedRun, ...]
+    has_yaw: bool
+    accuracy_m: float
+    notes: tuple[str, ...]
+
+
+def read_runs(path: Path, *, lost_s: float = LOST_S) -> LoggedRuns:
+    """Read the odometry of a log with the truth of its receiver.
+
+    Parameters
+    ----------
+    path : Path
+        ULog, DataFlash, or a bag with PX4's own messages.
+    lost_s : float
+        As `drift.pair_run` takes it.
+
+    Returns
+    -------
+    LoggedRuns
+        Poses are those at the times of the fixes.
+
+    Raises
+    ------
+    FlightError
+        If the log has no fixes of a receiver, no odometry, or none that fused no receiver; the message names what it
+        has, and the flags that tell.
+    """
+    log = _read(path)
+    poses = log.estimate.poses
+    has_yaw = bool(np.isfinite(poses.values[:, 3:]).all())
+    if log.attitudes is None and has_yaw:
+        raise log.source.fault(
+            f"{poses.name} has headings, and the log no attitudes to tell what they are turned by: log them"
+        )
+    stretches = _stretches(log, has_yaw=has_yaw)
+    runs = [pair_run(truth, own, sequence=str(path.resolve()), lost_s=lost_s) for truth, own in stretches]
+    if not runs:
+        raise log.source.fault(_why_none(log))
+    of = f"{counted(len(runs), 'stretch', 'stretches')} of {sum(run.path_m for run in runs):.0f} m"
+    notes = [
+        f"truth: {log.fixes.track.name}, fixes, {log.fixes.track.rate_hz:.3g} Hz",
+        f"odometry: {poses.name}, {of} without GNSS ({log.estimate.fused})",
+    ]
+    if not has_yaw:
+        notes.append("headings: the vehicle's own, so no drift of heading is measured")
+    return LoggedRuns(runs=tuple(runs), has_yaw=has_yaw, accuracy_m=log.fixes.accuracy_m, notes=(*notes, *log.notes))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Log:
+    """What a log has of truth and of odometry."""
+
+    source: LogSource
+    fixes: Fixes
+    estimate: Estimate
+    attitudes: Stream | None
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        source: LogSource,
+        fixes: tuple[Fixes, tuple[str, ...]],
+        estimates: Sequence[Estimate],
+        attitudes: Stream | None,
+        notes: tuple[str, ...],
+    ) -> "_Log":
+        """Return what a log has; raise `FlightError` if it has no fixes of a receiver, or no odometry."""
+        truth, others = fixes
+        if truth.is_estimate:
+            raise source.fault(
+                f"{truth.track.name} is an estimate, and no truth: drift needs the fixes of a receiver, logged all the "
+                "way though not fused"
+            )
+        if not estimates:
+            raise source.fault("holds no odometry: neither poses of a camera nor those of the estimator are logged")
+        return cls(source=source, fixes=truth, estimate=estimates[0], attitudes=attitudes, notes=(*others, *notes))
+
+
+def _read(path: Path) -> _Log:
+    suffix = path.suffix.lower()
+    if suffix == ".ulg":
+        return _of_px4(log_ulog.read_topics(path, log_ulog.OF_DRIFT))
+    if log_bags.is_bag(path):
+        return _of_px4(log_bags.read_topics(path, log_ulog.OF_DRIFT))
+    if suffix not in SUFFIXES:
+        bags = ", ".join(log_bags.BAGS)
+        raise FlightError(
+            f"{path.name or path} is no log with odometry that is read: {', '.join(SUFFIXES)} are, and bags of PX4 "
+            f"({bags}); trajectories in TUM files go by --truth and --estimate"
+        )
+    messages = log_dataflash.read_messages(path, log_dataflash.OF_DRIFT)
+    with known_fields(messages.source):
+        return _Log.of(
+            messages.source,
+            log_dataflash.fixes_of(messages),
+            log_dataflash.estimates_of(messages),
+            log_dataflash.attitudes_of(messages),
+            messages.notes,
+        )
+
+
+def _of_px4(topics: log_ulog.Topics) -> _Log:
+    with known_fields(topics.source):
+        return _Log.of(
+            topics.source,
+            log_ulog.fixes_of(topics),
+            log_ulog.estimates_of(topics),
+            log_ulog.attitudes_of(topics),
+            topics.notes,
+        )
+
+
+def _why_none(log: _Log) -> str:
+    """Return why no stretch is left."""
+    name, told = log.estimate.poses.name, log.estimate.fused
+    if not log.estimate.free_s:
+        return (
+            f"{name} fused GNSS from start to end ({told}): it is a copy of the truth, and no odometry; fly with a "
+            "receiver that is logged and not fused, or take a profile"
+        )
+    return f"{name} and {log.fixes.track.name} have no two moments in common while no GNSS was fused ({told})"
+
+
+def _stretches(log: _Log, *, has_yaw: bool) -> Iterator[tuple[Trajectory, Trajectory]]:
+    """Yield the truth and the estimate of each stretch, at the fixes within it."""
+    track, poses = log.fixes.track, log.estimate.poses
+    lon, lat, up = track.values.T
+    true_m = _plane_m(lon, lat)
+    is_known = poses.knows(track.time_s)
+    is_known &= log.attitudes is None or log.attitudes.knows(track.time_s)
+    for start_s, end_s in log.estimate.free_s:
+        at = np.flatnonzero(is_known & (track.time_s >= start_s) & (track.time_s <= end_s))
+        if len(at) < 2:  # a way
+            continue
+        time_s = track.time_s[at]
+        level = Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (len(at), 1)))
+        turned = level if log.attitudes is None else turned_at(log.attitudes, time_s)
+        truth = _trajectory(time_s, np.column_stack([true_m[at], np.nan_to_num(up[at])]), turned)
+        north, east, down = poses.at(time_s)[:, :3].T
+        own = turned_at(_quaternions(poses), time_s) if has_yaw else turned
+        yield truth, _trajectory(time_s, np.column_stack([east, north, -down]), own)
+
+
+def _quaternions(poses: Stream) -> Stream:
+    return Stream(name=poses.name, time_s=poses.time_s, values=poses.values[:, 3:])
+
+
+def _trajectory(time_s: Floats, position_m: Floats, of_ned: Rotation) -> Trajectory:
+    turns = Rotation.from_matrix(NED_OF_ENU.T @ of_ned.as_matrix())
+    return Trajectory(time_s=time_s, position_m=position_m, quaternion_xyzw=turns.as_quat())
+
+
+def _plane_m(lon_deg: Sequence[float] | Floats, lat_deg: Sequence[float] | Floats) -> Floats:
+    """Return east and north of places in metres without a scale, from the middle of them, shape (N, 2)."""
+    middle = f"+proj=aeqd +lon_0={np.median(lon_deg)} +lat_0={np.median(lat_deg)} +datum=WGS84"
+    return np.column_stack(pyproj.Proj(middle)(lon_deg, lat_deg))

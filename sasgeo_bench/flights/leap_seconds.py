@@ -42,3 +42,13 @@ def utc_of_week(week: int, week_s: float) -> float:
     '2025-01-19T23:59:42.500000+00:00'
     """
     return utc_of_gps(week * WEEK_S + week_s)
+
+
+def week_of_utc(utc_s: float) -> tuple[int, int]:
+    """Return the week of GPS, not wrapped, and the milliseconds in it, of seconds since 1970, UTC.
+
+    >>> week_of_utc(utc_of_week(2350, 86_400.5))
+    (2350, 86400500)
+    """
+    gps_ms = round((utc_s - GPS_EPOCH_S + bisect_right(_LEAPS, utc_s)) * 1000)
+    return divmod(gps_ms, WEEK_S * 1000)

@@ -126,6 +126,7 @@ def read_flight(
     height_m: float | None = None,
     facts: LogFacts | None = None,
     step_s: float = 0.2,
+    log: FlightLog | None = None,
 ) -> Trajectory:
     r"""Read a flight log and return its longest stretch inside a region.
 
@@ -146,6 +147,8 @@ def read_flight(
         What the file does not say: units of a table, axes of a TUM file, the speed of a log without times (10 m/s).
     step_s : float
         Seconds between poses.
+    log : FlightLog, optional
+        The points of the file, if they were read already.
 
     Returns
     -------
@@ -186,7 +189,8 @@ def read_flight(
     check_within("--margin-m", margin_m)
     if not (math.isfinite(step_s) and step_s > 0):
         raise FlightError(f"step_s must be positive, got {step_s!r}")
-    log = None if is_tum(path) else read_log(path, facts, height_m=height_m)
+    if log is None and not is_tum(path):
+        log = read_log(path, facts, height_m=height_m)
     if log is None:
         logged = read_poses(path, facts, height_m=height_m)
     else:
@@ -222,10 +226,26 @@ class FlownPath:
         asked = [sha256_of(self.file), self.file.name, asdict(self.facts), self.height_m, self.least_m]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 
+    @cached_property
+    def log(self) -> FlightLog | None:
+        """The points of the log; None of a file of poses."""
+        return None if is_tum(self.file) else read_log(self.file, self.facts, height_m=self.height_m)
+
+    @property
+    def start_s(self) -> float | None:
+        """When the log begins, seconds since 1970, UTC; None where it does not tell."""
+        return None if self.log is None else self.log.start_s
+
     def over(self, region: Region, *, margin_m: float) -> Trajectory:
         """Return the longest stretch over a region, as `read_flight` does."""
         return read_flight(
-            self.file, region, margin_m=margin_m, least_m=self.least_m, height_m=self.height_m, facts=self.facts
+            self.file,
+            region,
+            margin_m=margin_m,
+            least_m=self.least_m,
+            height_m=self.height_m,
+            facts=self.facts,
+            log=self.log,
         )
 
 

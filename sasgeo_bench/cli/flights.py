@@ -153,12 +153,14 @@ def measure_drift_command(drift: DriftOptions) -> None:
     lengths = drift.lengths
     _check_outputs(drift.inputs, [path for path in (drift.results, drift.profile) if path is not None])
     if drift.logs:
-        logged = _read_logs(drift.logs, drift.lost_s, drift.axes, min(lengths))
-        runs, has_yaw = [run for one in logged for run in one.runs], all(one.has_yaw for one in logged)
+        logged = _read_logs(drift)
+        runs, has_yaw = (
+            [run for one in logged.values() for run in one.runs],
+            all(one.has_yaw for one in logged.values()),
+        )
+        _show_logs(logged, min(lengths))
     else:
         runs, has_yaw = _read_runs(drift.truth or [], drift.estimate or [], drift.lost_s, drift.axes), True
-    if drift.profile is not None and not has_yaw:
-        raise FlightError("a profile needs headings, and the log has none but the vehicle's: leave out --profile")
     flights = counted(len({run.sequence for run in runs}), "sequence")
     tell(f"{counted(len(runs), 'run')} of {flights}, {sum(run.path_m for run in runs):.0f} m tracked")
     figures = measure_drift(runs, lengths_m=lengths)
@@ -177,18 +179,24 @@ def measure_drift_command(drift: DriftOptions) -> None:
         tell(f"wrote {drift.profile}: add where the data come from and where the profile must not be believed")
 
 
-def _read_logs(logs: list[Path], lost_s: float, axes: Axes | None, shortest_m: float) -> list[LoggedRuns]:
-    """Read the odometry of logs, and print what was read of each."""
-    if axes is not None:
+def _read_logs(drift: DriftOptions) -> dict[Path, LoggedRuns]:
+    """Read the odometry of logs, each once."""
+    if drift.axes is not None:
         raise FlightError("logs have axes of their own: leave out --axes")
-    logged = [read_runs(path, lost_s=lost_s) for path in dict.fromkeys(logs)]
-    for path, one in zip(dict.fromkeys(logs), logged, strict=True):
+    logged = {path: read_runs(path, lost_s=drift.lost_s) for path in drift.logs or []}
+    if drift.profile is not None and not all(one.has_yaw for one in logged.values()):
+        raise FlightError("a profile needs headings, and the log has none but the vehicle's: leave out --profile")
+    return logged
+
+
+def _show_logs(logged: dict[Path, LoggedRuns], shortest_m: float) -> None:
+    """Print what was read of each log, and how far its truth is to be trusted."""
+    for path, one in logged.items():
         for line in one.notes:
             say(f"{path.name}: {line}")
         if math.isfinite(one.accuracy_m):
             share = 100 * one.accuracy_m / shortest_m
             say(f"{path.name}: the receiver is good to {one.accuracy_m:.1f} m, {share:.2g} % of {shortest_m:g} m")
-    return logged
 
 
 def _summary(flown: Trajectory) -> str:

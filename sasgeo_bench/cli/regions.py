@@ -168,6 +168,9 @@ class NewRegionOptions(Options):
     photos: Annotated[
         Path | None, typer.Option(help="folder of photos: the place is where they are, and 500 m around")
     ] = None
+    flight: Annotated[
+        Path | None, typer.Option(help="log of a flight: the place is where it was flown, and 500 m around")
+    ] = None
     country: Annotated[str | None, typer.Option(help="country of the place, for its provenance and for splits")] = None
     date: Annotated[
         str | None, typer.Option(help="YYYY, YYYY-MM or YYYY-MM-DD: take the extract nearest to it; default: newest")
@@ -232,14 +235,26 @@ def new_region(options: NewRegionOptions) -> Path:
 def _place(options: NewRegionOptions) -> "Place":
     from sasgeo_bench.regions.new_region import Place  # noqa: PLC0415 - as above
 
-    ways = [options.center is not None, options.bounds is not None, options.photos is not None]
+    ways = [way is not None for way in (options.center, options.bounds, options.photos, options.flight)]
     if sum(ways) != 1 or (options.size is not None) != (options.center is not None):
-        raise ConfigError("say where the region lies by --center LON,LAT and --size 2km, by --bounds, or by --photos")
+        raise ConfigError(
+            "say where the region lies by --center LON,LAT and --size 2km, by --bounds, by --photos, or by --flight"
+        )
     if options.center is not None:
         return Place.around(options.center, options.size or "")
     if options.bounds is not None:
         return Place.within(options.bounds)
+    if options.flight is not None:
+        return Place.of_points(_flown_over(options.flight), noun="point")
     return Place.of_points(_taken_at(options.photos or Path()))
+
+
+def _flown_over(log: Path) -> NDArray[np.float64]:
+    """Return longitude and latitude of points of a log, of a thousand or two at most."""
+    from sasgeo_bench.flights.logs import read_places  # noqa: PLC0415 - as above
+
+    lonlat = read_places(log)
+    return lonlat[:: max(1, len(lonlat) // 1000)]
 
 
 def _taken_at(folder: Path) -> NDArray[np.float64]:

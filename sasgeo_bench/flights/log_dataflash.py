@@ -255,8 +255,7 @@ def estimates_of(messages: Messages) -> list[Estimate]:
         _check_sources(messages, name)
         told = [(seconds(one), _is_fused(one["SS"])) for _, one in messages.instances(flags_of, "C")]
         columns = cores[name]
-        own = np.full((len(columns["PN"]), 4), np.nan)
-        poses = np.column_stack([*(columns[key] for key in ("PN", "PE", "PD")), own])
+        poses = np.column_stack([columns[key] for key in ("PN", "PE", "PD")])
         stream = Stream.of(source, name, seconds(columns), poses)
         return [Estimate(poses=stream, free_s=free_stretches(told), fused=f"{flags_of}.SS")]
     return []

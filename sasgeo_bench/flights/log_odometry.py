@@ -7,7 +7,7 @@ logged.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +27,7 @@ from sasgeo_bench.flights.log_streams import (
     Stream,
     known_fields,
     turned_at,
+    without_unknown,
 )
 from sasgeo_bench.flights.trajectory import Trajectory
 
@@ -82,12 +83,12 @@ def read_runs(path: Path, *, lost_s: float = LOST_S) -> LoggedRuns:
     """
     log = _read(path)
     poses = log.estimate.poses
-    has_yaw = bool(np.isfinite(poses.values[:, 3:]).all())
+    has_yaw = log.estimate.has_attitudes
     if log.attitudes is None and has_yaw:
         raise log.source.fault(
             f"{poses.name} has headings, and the log no attitudes to tell what they are turned by: log them"
         )
-    stretches = _stretches(log, has_yaw=has_yaw)
+    stretches = _stretches(log)
     runs = [pair_run(truth, own, sequence=str(path.resolve()), lost_s=lost_s) for truth, own in stretches]
     if not runs:
         raise log.source.fault(_why_none(log))
@@ -120,16 +121,21 @@ class _Log:
         attitudes: Stream | None,
         notes: tuple[str, ...],
     ) -> "_Log":
-        """Return what a log has; raise `FlightError` if it has no fixes of a receiver, or no odometry."""
+        """Return what a log has; raise `FlightError` if it has no odometry."""
         truth, others = fixes
-        if truth.is_estimate:
-            raise source.fault(
-                f"{truth.track.name} is an estimate, and no truth: drift needs the fixes of a receiver, logged all the "
-                "way though not fused"
-            )
         if not estimates:
             raise source.fault("holds no odometry: neither poses of a camera nor those of the estimator are logged")
-        return cls(source=source, fixes=truth, estimate=estimates[0], attitudes=attitudes, notes=(*others, *notes))
+        estimate = estimates[0]
+        poses = without_unknown(estimate.poses)
+        if poses is None:
+            raise source.fault(f"{estimate.poses.name} has no pose with a place and an attitude: log them")
+        return cls(
+            source=source,
+            fixes=truth,
+            estimate=replace(estimate, poses=poses),
+            attitudes=without_unknown(attitudes),
+            notes=(*others, *notes),
+        )
 
 
 def _read(path: Path) -> _Log:
@@ -177,7 +183,7 @@ def _why_none(log: _Log) -> str:
     return f"{name} and {log.fixes.track.name} have no two moments in common while no GNSS was fused ({told})"
 
 
-def _stretches(log: _Log, *, has_yaw: bool) -> Iterator[tuple[Trajectory, Trajectory]]:
+def _stretches(log: _Log) -> Iterator[tuple[Trajectory, Trajectory]]:
     """Yield the truth and the estimate of each stretch, at the fixes within it."""
     track, poses = log.fixes.track, log.estimate.poses
     lon, lat, up = track.values.T
@@ -193,7 +199,7 @@ def _stretches(log: _Log, *, has_yaw: bool) -> Iterator[tuple[Trajectory, Trajec
         turned = level if log.attitudes is None else turned_at(log.attitudes, time_s)
         truth = _trajectory(time_s, np.column_stack([true_m[at], np.nan_to_num(up[at])]), turned)
         north, east, down = poses.at(time_s)[:, :3].T
-        own = turned_at(_quaternions(poses), time_s) if has_yaw else turned
+        own = turned_at(_quaternions(poses), time_s) if log.estimate.has_attitudes else turned
         yield truth, _trajectory(time_s, np.column_stack([east, north, -down]), own)
 
 

@@ -28,6 +28,7 @@ MOST_LOG_BYTES: Final = 2 * 2**30  # its readers keep no more than the streams t
 LEAST_FIX: Final = 3  # of MAVLink, PX4 and ArduPilot alike: a place in three dimensions
 
 _MOST_APART_S: Final = 1.0  # from a fix to a height or an attitude that is its own
+_BEYOND_S: Final = 0.1  # two clocks of one computer agree so well
 _JUMP_S: Final = 1.0  # of a clock; what is written late is less out of order
 _SILENT_S: Final = 5.0  # PX4 sends its flags each second, ArduPilot ten times
 _STILL_S: Final = 2.0  # by which two clocks of a flight may part
@@ -83,13 +84,14 @@ class Stream:
         return 1 / float(np.median(np.diff(self.time_s))) if len(self) > 1 else 0.0
 
     def knows(self, time_s: Floats) -> Bools:
-        """Return for which times there are values before and after within a second of each, shape of the times."""
+        """Return which times lie between values that are within a second of each, or just beyond the ends."""
         if not len(self):
             return np.zeros(len(time_s), dtype=bool)
-        after = np.searchsorted(self.time_s, time_s)
-        next_s = self.time_s[np.minimum(after, len(self) - 1)]
+        next_s = self.time_s[np.minimum(np.searchsorted(self.time_s, time_s), len(self) - 1)]
         last_s = self.time_s[np.maximum(np.searchsorted(self.time_s, time_s, side="right") - 1, 0)]
-        return np.asarray((np.abs(next_s - time_s) <= _MOST_APART_S) & (np.abs(time_s - last_s) <= _MOST_APART_S))
+        beyond_s = np.maximum(last_s - time_s, time_s - next_s)
+        is_near = (next_s - time_s <= _MOST_APART_S) & (time_s - last_s <= _MOST_APART_S)
+        return np.asarray(is_near & (beyond_s <= _BEYOND_S))
 
     def at(self, time_s: Floats) -> Floats:
         """Return values by lines between those of the stream, the ends' own beyond, shape (times, K).
@@ -204,8 +206,8 @@ class Estimate:
     ----------
     poses : Stream
         North, east, down in metres from any place, then quaternions x, y, z, w from the body to that frame, shape
-        (N, 7). A frame may be turned about the vertical. Quaternions are not a number where the estimate has none of
-        its own: it is then turned as the vehicle is.
+        (N, 7), whose frame may be turned about the vertical; or shape (N, 3) of an estimate whose attitudes are those
+        of the vehicle.
     free_s : tuple of pairs of float
         From when to when no receiver was fused, seconds of the log's clock.
     fused : str
@@ -215,6 +217,11 @@ class Estimate:
     poses: Stream
     free_s: tuple[tuple[float, float], ...] = ((-np.inf, np.inf),)
     fused: str = "of a camera"
+
+    @property
+    def has_attitudes(self) -> bool:
+        """Return whether the estimate has attitudes of its own."""
+        return bool(self.poses.values.shape[1] > 3)  # a place
 
 
 def free_stretches(flags: Sequence[tuple[Floats, Bools]]) -> tuple[tuple[float, float], ...]:
@@ -312,7 +319,7 @@ def without_unknown(stream: Stream | None) -> Stream | None:
 def flight_of(source: LogSource, streams: Streams) -> FlightLog:
     """Return the flight at the times of its fixes.
 
-    A height or an attitude belongs to a fix if the stream has values within a second before and after. Where they are
+    A height or an attitude belongs to a fix between two of its values within a second of it. Where they are
     missing of less than half of the fixes, these are left out and counted; where of more, the quantity is not read.
 
     Raises

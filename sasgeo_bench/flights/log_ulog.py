@@ -247,7 +247,7 @@ def estimates_of(topics: Topics) -> list[Estimate]:
     name, columns = local
     free_s, fused = _without_receiver(topics)
     is_valid = np.asarray(columns.get("xy_valid", np.ones(len(columns["timestamp"]))), dtype=bool)
-    poses = np.column_stack([*(columns[key] for key in ("x", "y", "z")), np.full((len(is_valid), 4), np.nan)])
+    poses = np.column_stack([columns[key] for key in ("x", "y", "z")])
     stream = Stream.of(topics.source, name, seconds(columns)[is_valid], poses[is_valid])
     return [Estimate(poses=stream, free_s=free_s, fused=fused)]
 

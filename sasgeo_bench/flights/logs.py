@@ -80,6 +80,14 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
     return replace(log, height_m=np.full(len(log), height_m), notes=notes)
 
 
+def read_places(path: Path) -> Floats:
+    """Return longitude and latitude of the points of a log, shape (N, 2); what else it holds needs no unit."""
+    is_table = path.suffix.lower() in (".csv", ".pos")
+    facts = LogFacts(time_unit="none", height_unit="none", angle_unit="none") if is_table else None
+    log = read_log(path, facts)
+    return np.column_stack([log.lon_deg, log.lat_deg])
+
+
 def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     suffix = path.suffix.lower()
     reader = read_bag if is_bag(path) else _READERS.get(suffix)
@@ -265,6 +273,11 @@ def _check_near(log: FlightLog, path: Path, region: Region) -> None:
 def _on_grid(log: FlightLog, path: Path, epsg: int, speed_mps: float) -> Trajectory:
     """Return the points of a log in a projected CRS; without a heading yaw is 0."""
     up_m = log.height_m
+    if up_m is not None and (highest_m := float(up_m.max())) < LOWEST_M:
+        raise FlightError(
+            f"{path.name} never leaves the ground: {highest_m:.1f} m above it at most, {LOWEST_M:g} m are needed: take "
+            "another log, or say a height, as in --height-m 100"
+        )
     if up_m is None:
         why = "" if log.altitude_m is None else ", and its altitudes do not count from there"
         raise FlightError(f"{path.name} has no height above the ground{why}: say one, as in --height-m 100")

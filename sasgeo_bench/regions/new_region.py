@@ -93,23 +93,24 @@ class Place:
         return cls(bounds_lonlat=(west, south, east, north))
 
     @classmethod
-    def of_points(cls, lonlat: NDArray[np.float64]) -> Self:
+    def of_points(cls, lonlat: NDArray[np.float64], *, noun: str = "photo") -> Self:
         """Return the place of points, longitude and latitude of shape (N, 2) in degrees, with `MARGIN_M` around them.
 
-        Raise `ConfigError` if there is no point, or some lie more than `APART_M` from all others.
+        Raise `ConfigError` if there is no point, or some lie more than `APART_M` from all others; `noun` says what
+        they are of.
 
         >>> Place.of_points(np.array([[9.52, 47.15], [9.53, 47.15]])).size_m
         (1759.0, 1006.0)
         """
         if not len(lonlat):
-            raise ConfigError("no photo says where it was taken: name the place by --center or --bounds")
+            raise ConfigError(f"no {noun} says where it was taken: name the place by --center or --bounds")
         groups = _groups(lonlat)
         if len(groups) > 1:
             middles = [np.median(one, axis=0).round(3).tolist() for one in groups]
-            listed = [f"{counted(len(one), 'photo')} near {at}" for one, at in zip(groups, middles, strict=True)]
+            listed = [f"{counted(len(one), noun)} near {at}" for one, at in zip(groups, middles, strict=True)]
             raise ConfigError(
-                f"the photos lie in {len(groups)} places more than {APART_M / 1000:.0f} km apart, {'; '.join(listed)}: "
-                "name a folder for each place"
+                f"the {noun}s lie in {len(groups)} places more than {APART_M / 1000:.0f} km apart, "
+                f"{'; '.join(listed)}: make a region of each"
             )
         epsg = utm_epsg(*np.median(lonlat, axis=0).tolist())
         points_m = np.column_stack(from_lonlat(epsg).transform(lonlat[:, 0], lonlat[:, 1]))

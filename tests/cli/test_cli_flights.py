@@ -12,6 +12,7 @@ from sasgeo_bench.flights.drift_profile import load_profile, read_drift_profile
 from sasgeo_bench.flights.odometry import dead_reckon, draw_odometry
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum, write_tum
 from sasgeo_bench.regions.region_files import read_region
+from tests.flights.autopilots import Flown, fusing, px4_drift, tlog, ulog, write
 
 
 @pytest.fixture
@@ -208,3 +209,53 @@ def test_a_cameras_axes_are_refused_and_read_where_they_are_said(program, mistak
     position = next(line.split() for line in out.splitlines() if line.startswith("position_pct "))
     assert float(position[2]) == pytest.approx(4.7, abs=0.3)
     assert "301 poses, 300 m over the ground" in program("read-flight", "truth.txt", "--axes", "camera")[1]
+
+
+# Logs of autopilots
+
+
+def test_what_is_read_of_the_log_of_an_autopilot_is_printed_with_its_messages(program, mistake, tmp_path) -> None:
+    pytest.importorskip("pymavlink", reason="needs the extra [logs]")
+    write(tmp_path / "log.tlog", tlog(Flown(), systems=(1, 2)))
+    assert "vehicles 1, 2 send places: say which one, as in --vehicle 1" in mistake("read-flight", "log.tlog")
+    code, out, err = program("read-flight", "log.tlog", "--vehicle", "2")
+    assert (code, err) == (0, "")
+    assert out.splitlines() == [
+        "200 points, 317 m, 39.8 s, 7.95 m/s on average",
+        "starts at 2025-05-01T10:00:00.000+00:00",
+        "place: GPS_RAW_INT, fixes, 5 Hz, accuracy 1.2 m (median)",
+        "altitude: above the geoid (the sea)",
+        "height: GLOBAL_POSITION_INT.relative_alt, above take-off",
+        "attitude: ATTITUDE, yaw from true north",
+        "clock: UTC by time_unix_usec of SYSTEM_TIME",
+        "not read: GLOBAL_POSITION_INT",
+        "vehicle 2, component 1",
+        "height from 0.0 to 80.0 m",
+        "altitude from 480.0 to 560.0 m",
+        "yaw from 0.0 to 359.5 deg",
+        "pitch from 0.0 to 0.0 deg",
+        "roll from 0.0 to 0.0 deg",
+    ]
+
+
+def test_drift_of_a_log_is_that_of_its_stretches_without_gnss(program, mistake, tmp_path) -> None:
+    pytest.importorskip("pyulog", reason="needs the extra [logs]")
+    status = {("estimator_status", 0): fusing(lambda time_s: time_s < 20)}
+    write(tmp_path / "a.ulg", ulog(px4_drift(1.02, status)))
+    write(tmp_path / "b.ulg", ulog(px4_drift(1.04, status)))
+    code, out, err = program("measure-drift", "a.ulg", "b.ulg", "--lengths-m", "100,200")
+    assert code == 0
+    assert err.startswith("2 runs of 2 sequences, ")
+    lines = out.splitlines()
+    assert lines[1].startswith("a.ulg: odometry: vehicle_local_position 0, 1 stretch of ")
+    assert "a.ulg: the receiver is good to 1.2 m, 1.2 % of 100 m" in lines
+    rows = [line.split() for line in lines if line.startswith("position_pct ")]
+    assert [row[1] for row in rows] == ["100", "200"]
+    assert all(float(row[2]) == pytest.approx(3, abs=0.02) for row in rows)
+    assert "yaw_deg" not in out  # the estimator turned as the vehicle did
+    assert "a profile needs headings" in mistake("measure-drift", "a.ulg", "b.ulg", "--profile", "mine.toml")
+    assert "leave out --axes" in mistake("measure-drift", "a.ulg", "--axes", "up")
+    for words in ((), ("a.ulg", "--truth", "b.txt")):
+        assert "say either logs, or --truth and --estimate" in mistake("measure-drift", *words)
+    write(tmp_path / "c.ulg", ulog(px4_drift(1.02, {("estimator_status", 0): fusing(lambda _: True)})))
+    assert "it is a copy of the truth, and no odometry" in mistake("measure-drift", "c.ulg")

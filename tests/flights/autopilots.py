@@ -2,11 +2,12 @@
 """Logs of autopilots as tests write them: one flight, in every format, with what each format has besides."""
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
 
 LON, LAT = 9.52, 47.14
@@ -25,9 +26,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Flown:
-    """A climb to 80 m and a flight to the north-east at about 8 m/s, five fixes a second."""
+    """A climb to 80 m, unless it is level there, and a flight to the north-east at about 8 m/s, five fixes a second."""
 
     count: int = 200
+    is_level: bool = False
     time_s: Floats = field(init=False)
     lon_deg: Floats = field(init=False)
     lat_deg: Floats = field(init=False)
@@ -40,7 +42,7 @@ class Flown:
             "time_s": at * 0.2,
             "lon_deg": (LON + at * 1.5e-5).round(7),
             "lat_deg": (LAT + at * 1e-5).round(7),
-            "height_m": np.minimum(at * 1.0, 80.0),
+            "height_m": np.full(self.count, 80.0) if self.is_level else np.minimum(at * 1.0, 80.0),
             "yaw_deg": (350.0 + at * 0.5) % 360.0,  # over north
         }.items():
             object.__setattr__(self, name, values)
@@ -137,7 +139,7 @@ def write(path: Path, data: bytes) -> Path:
 
 # DataFlash
 
-_DATAFLASH = {"Q": "Q", "B": "B", "I": "I", "H": "H", "L": "i", "e": "i", "c": "h", "C": "H", "f": "f", "n": "4s"}
+_DATAFLASH = {"L": "i", "e": "i", "c": "h", "C": "H", "n": "4s", "N": "16s"}
 _PARTS = {"L": 1e7, "e": 100, "c": 100, "C": 100}
 # Message -> number, format and columns, as ArduPilot 4.5 declares them (GPS without its last columns).
 MESSAGES = {
@@ -175,7 +177,7 @@ def dataflash_text(rows: Mapping[str, Sequence[tuple]]) -> bytes:
     for name in rows:
         number, form, columns = MESSAGES[name]
         lines.append(f"FMT, {number}, 99, {name}, {form}, {columns}")
-        body += [(int(row[0]), ", ".join([name, *map(repr, row)])) for row in rows[name]]
+        body += [(int(row[0]), ", ".join([name, *map(str, row)])) for row in rows[name]]
     return "\n".join([*lines, *(line for _, line in sorted(body, key=lambda item: item[0])), ""]).encode()
 
 
@@ -248,8 +250,9 @@ PX4_TYPES = {
         "uint64 timestamp\nint32 lat\nint32 lon\nint32 alt\nfloat32 eph\nuint8 fix_type\nuint64 time_utc_usec"
     ),
     "VehicleAttitude": "uint64 timestamp\nfloat32[4] q",
-    "VehicleLocalPosition": "uint64 timestamp\nfloat32 z\nbool z_valid",
+    "VehicleLocalPosition": "uint64 timestamp\nfloat32 x\nfloat32 y\nfloat32 z\nbool xy_valid\nbool z_valid",
     "HomePosition": "uint64 timestamp\nfloat32 z",
+    "EstimatorStatusFlags": "uint64 timestamp\nbool cs_gps",
 }
 MORE_TYPES = {
     "foxglove_msgs/msg/LocationFix": (
@@ -330,10 +333,12 @@ def mavros_messages(flown: Flown, *, late_s: float = 0.03, status: int = 0) -> l
     return messages
 
 
+_PX4_FIELDS = {line.split()[1] for text in PX4_TYPES.values() for line in text.splitlines()}
+
+
 def px4_messages(flown: Flown, *, is_new: bool = True) -> list[Message]:
     """What PX4 publishes over its bridge, stamped by its own clock."""
     kind = "SensorGps" if is_new else "VehicleGpsPosition"
-    names = [line.split()[1] for line in PX4_TYPES[kind].splitlines()]
     topics = px4_topics(flown, is_new=is_new)
     messages: list[Message] = []
     tables = {
@@ -347,6 +352,47 @@ def px4_messages(flown: Flown, *, is_new: bool = True) -> list[Message]:
         columns = [one.split(" ")[1] for one in fields.strip(";").split(";")]
         for row in rows:
             values = dict(zip(columns, [row[0], row[1:]] if name == "VehicleAttitude" else row, strict=True))
-            kept = {key: value for key, value in values.items() if key in (*names, "q", "z", "z_valid")}
+            kept = {key: value for key, value in values.items() if key in _PX4_FIELDS}
             messages.append((f"/fmu/out/{topic}", f"px4_msgs/msg/{name}", START_S * 10**9 + int(row[0]) * 1000, kept))
     return sorted(messages, key=lambda one: one[2])
+
+
+# Drift
+
+LEVEL = Flown(count=600, is_level=True)  # 950 m
+STATUS = "uint64_t timestamp;uint32_t control_mode_flags;"
+_GPS_BIT = 1 << 2
+_OTHERS = 1 << 0 | 1 << 1 | 1 << 7 | 1 << 12  # aligned, in the air, with poses of a camera
+
+
+def north_east_m(flown: Flown = LEVEL) -> Floats:
+    """North and east of the first fix by geodesics, shape (N, 2), metres."""
+    count = len(flown.time_s)
+    first = [np.full(count, flown.lon_deg[0]), np.full(count, flown.lat_deg[0])]
+    azimuth_deg, _, way_m = pyproj.Geod(ellps="WGS84").inv(*first, flown.lon_deg, flown.lat_deg)
+    return np.stack([way_m * np.cos(np.radians(azimuth_deg)), way_m * np.sin(np.radians(azimuth_deg))], axis=1)
+
+
+def px4_drift(scale: float, flags: Mapping, *, fix_type: int = 3, **more) -> dict:
+    """A ULog whose estimate is too long by a scale, with flags of its own."""
+    place_m = north_east_m() * scale
+    stamps = stamps_us(LEVEL.time_s)
+    local = [
+        (us, north, east, -float(up), True, True)
+        for us, (north, east), up in zip(stamps, place_m.tolist(), LEVEL.height_m, strict=True)
+    ]
+    attitude = [(us, *turn(yaw)) for us, yaw in zip(stamps, LEVEL.yaw_deg.tolist(), strict=True)]
+    return {
+        ("vehicle_gps_position", 0): (GPS_114, gps_rows(LEVEL, fix_type=fix_type)),
+        ("vehicle_local_position", 0): (LOCAL, local),
+        ("vehicle_attitude", 0): (ATTITUDE, attitude),
+        **flags,
+        **more,
+    }
+
+
+def fusing(is_fused: Callable[[float], bool], *, every_s: float = 0.5) -> tuple[str, list[tuple]]:
+    """Flags of an estimator that fuses GNSS, or does not, at times of the flight."""
+    times_s = np.arange(0, LEVEL.time_s[-1], every_s)
+    rows = [(us, _OTHERS | _GPS_BIT * is_fused(one)) for us, one in zip(stamps_us(times_s), times_s, strict=True)]
+    return STATUS, rows

@@ -406,6 +406,12 @@ def test_heights_come_from_the_log_or_are_given(written: Callable, region: Regio
         read_flight(without, region)
 
 
+def test_a_flight_that_never_leaves_the_ground_is_refused(written: Callable, region: Region) -> None:
+    path = written("a.csv", _table(region, _across(region), more=",height_m", cells=",4.5"))
+    with pytest.raises(FlightError, match=r"a\.csv never leaves the ground: 4\.5 m above it at most, 5 m are needed"):
+        read_flight(path, region)
+
+
 def test_what_is_on_the_ground_is_left_out(written: Callable, region: Region) -> None:
     places = _across(region)
     lines = _table(region, places, more=",height_m").splitlines()

@@ -298,10 +298,20 @@ def test_the_place_of_photos_is_where_they_are_and_those_without_a_place_are_nam
     assert spec.size_m == pytest.approx((1076, 1001), abs=3)
 
 
+def test_the_place_of_a_flight_is_where_it_was_flown_whatever_its_units(garden, program, tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("\n".join(["t,latitude,longitude,height", f"1,{LAT},{LON},9", f"2,{LAT},{LON + 0.001},9", ""]))
+    code, _, err = program("new-region", "mine", "--flight", log, "--extracts", garden)
+    assert code == 0, err
+    spec = read_region_file(tmp_path / "my-regions/mine.toml")
+    assert spec.center_lonlat == pytest.approx((LON + 0.0005, LAT), abs=2e-5)
+    assert spec.size_m == pytest.approx((1076, 1001), abs=3)
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--center", "9.5,47.1"], "say where the region lies by --center LON,LAT and --size 2km, by --bounds, or by"),
+        (["--center", "9.5,47.1"], "say where the region lies by --center LON,LAT and --size 2km, by --bounds, by"),
         (["--size", "2km", "--bounds", "9,47,10,48"], "say where the region lies"),
         (["--center", "9.5,47.1", "--size", "2km", "--bounds", "9,47,10,48"], "say where the region lies"),
         (["--center", "9.5,47.1", "--size", "0km"], "size_m must be two positive lengths"),
@@ -313,6 +323,8 @@ def test_the_place_of_photos_is_where_they_are_and_those_without_a_place_are_nam
         (["--photos", "photos.zip"], "photos.zip is a file: unpack it"),
         (["--photos", "."], "holds no photo"),
         (["--photos", "bare"], "no photo says where it was taken"),
+        (["--flight", "nowhere.gpx"], "there is no flight log nowhere.gpx"),
+        (["--flight", "photos.zip"], "photos.zip is no flight log that is read"),
         (["--center", "9.5,47.1", "--size", "300m", "--most-mb", "0"], "europe/liechtenstein-latest.osm.pbf"),
     ],
 )

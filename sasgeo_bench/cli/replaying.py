@@ -123,7 +123,7 @@ def _send(
     late = f"late by {report.late_ms(0.5):.1f} ms (p50), {report.late_ms(0.99):.1f} ms (p99)"
     say(f"{counted(len(sent), 'fix', 'fixes')} sent to {target.text}, {late}")
     if report.refused:
-        complain(f"nobody listens at {target.text}: the system refused {report.refused} of {report.packets} packets")
+        complain(f"nobody listened at {target.text} to {report.refused} of {counted(report.packets, 'packet')}")
         raise typer.Exit(CONTESTANT_FAILED)
 
 

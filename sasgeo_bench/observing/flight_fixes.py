@@ -189,7 +189,9 @@ def _placed(
     heads: Sequence[Head], answers: Sequence[Prediction], times_ns: Sequence[int], epsg: int
 ) -> list[PlacedFix]:
     """Return the fixes among the answers to the views of one flight, in order."""
-    delays_s = _delays_s(answers, times_ns)
+    # What failed or hung is no part of a fix's delay: the runner ended it.
+    latencies_s = [0.0 if answer.status != "ok" else answer.latency_s for answer in answers]
+    delays_s = _delays_s(latencies_s, times_ns)
     at = [index for index, answer in enumerate(answers) if answer.status == "ok" and answer.candidates]
     poses = [answers[index].candidates[0][0] for index in at]
     if not poses:
@@ -227,20 +229,20 @@ def _placed(
     return found
 
 
-def _delays_s(answers: Sequence[Prediction], times_ns: Sequence[int]) -> list[float | None]:
+def _delays_s(latencies_s: Sequence[float | None], times_ns: Sequence[int]) -> list[float | None]:
     """Return how long after each view its answer is there, if one computer answers them in order.
 
     None from the first answer on whose latency is not known.
     """
     found: list[float | None] = []
     free_s = -math.inf
-    for answer, time_ns in zip(answers, times_ns, strict=True):
-        if answer.status == "ok" and answer.latency_s is None:
+    for latency_s, time_ns in zip(latencies_s, times_ns, strict=True):
+        if latency_s is None:
             break
-        view_s = time_ns / NS
-        free_s = max(view_s, free_s) + (answer.latency_s or 0.0)
+        view_s = (time_ns - times_ns[0]) / NS
+        free_s = max(view_s, free_s) + latency_s
         found.append(free_s - view_s)
-    return [*found, *[None] * (len(answers) - len(found))]
+    return [*found, *[None] * (len(times_ns) - len(found))]
 
 
 def _turned(covariance: Sequence[float], north_deg: float) -> tuple[float, ...]:
@@ -278,11 +280,14 @@ def _located(folder: Path) -> FlightFixes:
         raise ConfigError(f"{folder} has no fix that can be replayed: {why}")
     if len(timed) < len(fixes):
         tell(f"{counted(len(fixes) - len(timed), 'picture')} without a time: left out")
+    times_ns = [fix.time_ns or 0 for fix in timed]
+    delays_s = _delays_s([fix.delay_s for fix in timed], times_ns)
+    timed = [replace(fix, delay_s=delay_s) for fix, delay_s in zip(timed, delays_s, strict=True)]
     return FlightFixes(
         flight=re.sub(r"[^\w.-]+", "-", folder.name) or "pictures",
         fixes=tuple(timed),
         views=len(rows),
-        begin_ns=timed[0].time_ns or 0,
+        begin_ns=times_ns[0],
         clock="camera",
         epsg=None,
     )

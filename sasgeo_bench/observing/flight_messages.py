@@ -8,6 +8,7 @@ what ArduPilot and PX4 do with them; `docs/howto/replay.md` says which.
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
+from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
@@ -149,7 +150,7 @@ def departures(
             continue
         next_s = view_s + delay + (0.0 if rate_hz is None else 1 / rate_hz)
         found.append(Departure(fix=fix, view_s=view_s, sent_s=view_s + delay, resets=resets % _RESETS))
-    return tuple(sorted(found, key=lambda one: one.sent_s))
+    return tuple(found)
 
 
 def origin_of(sent: Sequence[Departure]) -> Origin:
@@ -193,8 +194,7 @@ def gps_input(fix: PlacedFix, stamp_ns: int, utc_ns: int | None) -> GpsInput:
 
 def vision_position_estimate(one: Departure, origin: Origin, stamp_ns: int) -> VisionPositionEstimate:
     """Return a fix in the local frame of an origin: metres along WGS84 in the direction seen from there."""
-    plane = pyproj.Proj(proj="aeqd", lon_0=origin.lon_deg, lat_0=origin.lat_deg, ellps="WGS84")
-    east_m, north_m = plane(one.fix.lon_deg, one.fix.lat_deg)
+    east_m, north_m = _plane(origin)(one.fix.lon_deg, one.fix.lat_deg)
     return VisionPositionEstimate(
         usec=stamp_ns // 1000,
         x=north_m,
@@ -203,6 +203,11 @@ def vision_position_estimate(one: Departure, origin: Origin, stamp_ns: int) -> V
         covariance=_triangle(one.fix.covariance),
         reset_counter=one.resets,
     )
+
+
+@lru_cache(maxsize=8)
+def _plane(origin: Origin) -> pyproj.Proj:
+    return pyproj.Proj(proj="aeqd", lon_0=origin.lon_deg, lat_0=origin.lat_deg, ellps="WGS84")
 
 
 def _matrix(covariance: Sequence[float]) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:

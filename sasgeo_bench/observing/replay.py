@@ -221,9 +221,9 @@ def replay(request: ReplayRequest) -> ReplayReport:
         progress.begin(label, len(request.sent))
         late_s = []
         for one in request.sent:
-            link.listen_until(one.sent_s)
             stamp_ns, utc_ns = clock.stamp_ns(one.view_s), clock.utc_ns(one.view_s)
             message = message_of(one, request.kind, request.origin, stamp_ns, utc_ns)
+            link.listen_until(one.sent_s)
             link.send(message)
             late_s.append(-clock.left_s(one.sent_s))
             progress.advance(label, 1)

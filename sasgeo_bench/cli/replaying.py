@@ -100,7 +100,7 @@ def _send(
     options: ReplayOptions,
 ) -> None:
     if kind != "gps_input":
-        check_accepted(sent, "VISION_POSITION_ESTIMATE can")
+        check_accepted(sent, "VISION_POSITION_ESTIMATE cannot")
     clock = options.clock or ("now" if flight.start_ns is None else "log")
     if clock == "log":
         check_dated(flight, "--clock log")

@@ -40,7 +40,7 @@ def check_output(path: Path, flight: FlightFixes, sent: Sequence[Departure], kin
     if suffix in _DATED:
         check_dated(flight, path.name)
     if suffix in _ALL_ALIKE or (suffix == CSV and kind != "gps_input"):
-        check_accepted(sent, f"{path.name} would")
+        check_accepted(sent, f"{path.name} would not")
 
 
 def check_dated(flight: FlightFixes, what: str) -> None:
@@ -56,7 +56,7 @@ def check_accepted(sent: Sequence[Departure], what: str) -> None:
     """Raise `ConfigError` if a fix is not accepted, where nothing can say so."""
     if not all(one.fix.is_accepted for one in sent):
         raise ConfigError(
-            f"{what} not say which fixes are accepted: leave out --all, or take .geojson, .gpx, .mcap or --as gps_input"
+            f"{what} say which fixes are accepted: leave out --all, or take .geojson, .gpx, .mcap or --as gps_input"
         )
 
 

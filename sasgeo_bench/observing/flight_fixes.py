@@ -25,7 +25,8 @@ from sasgeo_bench.observing.results import TABLE, placed
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.prediction_files import RUN, Answers, RunManifest
-from sasgeo_bench.tasks.query import UTC, Head, Truth
+from sasgeo_bench.tasks.flight_sampling import UTC
+from sasgeo_bench.tasks.query import Head, Truth
 from sasgeo_bench.tasks.task_files import TASK, Task
 
 Floats = NDArray[np.float64]

@@ -23,7 +23,6 @@ from sasgeo_bench.tasks.query import (
     SEQUENCE_DIGITS,
     TWIN_EAST,
     TWIN_NORTH,
-    UTC,
     PriorGroup,
     Query,
     Step,
@@ -60,6 +59,7 @@ from sasgeo_bench.tasks.suites.flights import (
 
 Floats = NDArray[np.float64]
 
+UTC: Final = "utc_s"  # measured: when a view of a logged flight was flown, seconds since 1970; the log may not tell it
 _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 
 

@@ -27,7 +27,6 @@ TWIN_EAST, TWIN_NORTH = "twin_east_m", "twin_north_m"  # measured: offset from a
 TWIN_TURN: Final = "twin_turn_deg"  # measured: clockwise, from a heading to that at which the twin looks like it
 CEILING: Final = "ceiling"  # measured: the most that a matcher can expect, where copies leave nothing to tell them by
 UNRIVALLED: Final = "unrivalled"  # begins the kind of a stress whose rival is out of reach: it decides nothing
-UTC: Final = "utc_s"  # measured: when a view of a logged flight was flown, seconds since 1970; the log may not tell it
 COPIES: Final = "twins"  # measured: exact copies of the place among the candidates
 TRUTH_SIGMA: Final = "m, standard deviation of the truth"  # unit of the strength of truths that are not exact
 TASK_VERSION: Final = 5  # of queries.parquet and truth.parquet: raised when the same request gives other queries

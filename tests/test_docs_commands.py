@@ -84,7 +84,6 @@ OTHERS = {
     r"^python answer\.py ": "tests/experiments/test_board_queries.py runs this program on a small board",
     r"^python benchmarks/segmenters\.py ": "minutes; tests/scoring/test_segmenter_program.py makes a small board",
     r"^python benchmarks/(real_)?pictures\.py ": "needs extracts and pictures",
-    r"^python benchmarks/replay\.py ": "a minute, by the clock; tests/observing/test_replay.py sends as it does",
     r"^python benchmarks/self_train\.py ": "needs pictures, PyTorch and minutes; tests/baselines/test_self_training.py",
     r"^python benchmarks/image_matchers\.py ": "minutes of matching, on a region with imagery and a task of pictures",
     r"^python benchmarks/(open_numbers|scorer_trials)\.py ": "minutes; tests/baselines/test_tunable.py makes some",

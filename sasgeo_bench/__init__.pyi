@@ -5,7 +5,9 @@ from .boards.board import StoredBoard as StoredBoard
 from .boards.board import read_board as read_board
 from .boards.cases import plot_evidence as plot_evidence
 from .boards.cases import plot_query as plot_query
+from .boards.flight_plots import plot_flight as plot_flight
 from .cli.boards import score as score
+from .cli.flights import import_flight as import_flight
 from .cli.importing_photos import import_masks as import_masks
 from .cli.importing_photos import import_photos as import_photos
 from .cli.observing import locate as locate
@@ -20,6 +22,8 @@ from .cli.splits import new_split as new_split
 from .core.storage import fetch as fetch
 from .core.storage import send as send
 from .core.texts import MOST_CANDIDATES as MOST_CANDIDATES
+from .flights.logs import read_flight as read_flight
+from .flights.trajectory import Trajectory as Trajectory
 from .geometry.grid import Grid as Grid
 from .geometry.pose import Pose as Pose
 from .geometry.pose import Prior as Prior

@@ -12,9 +12,11 @@ import cv2
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from sasgeo_bench.boards.cases import MapPart, window_around
 from sasgeo_bench.boards.plots import (
     FAINT,
     INTERVALS,
@@ -29,14 +31,17 @@ from sasgeo_bench.boards.plots import (
     those_there,
     ticks_across,
 )
-from sasgeo_bench.core.canvas import Page, page, panels
-from sasgeo_bench.core.errors import StoreError, counted
+from sasgeo_bench.core.canvas import Page, new_figure, page, panels, styled, without_ticks
+from sasgeo_bench.core.errors import ConfigError, StoreError, check_given, counted
 from sasgeo_bench.core.folders import scratch_folder
+from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.preview import HIDDEN, scale_bar
+from sasgeo_bench.regions.region import Region
 from sasgeo_bench.scoring.flights import DRIFT_M, RECKONED_M
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import CONTROL, DRIFT, GROUP, primary_rows
-from sasgeo_bench.tasks.sheet import Ground, bounds_of_m, draw_flight, flight_keys, flight_panels
+from sasgeo_bench.tasks.sheet import TRUE, Ground, bounds_of_m, draw_flight, flight_keys, flight_panels
 from sasgeo_bench.tasks.task_files import Task
 
 MOST_TRACKERS: Final = 6
@@ -61,6 +66,83 @@ def shown_flight(scores: Mapping[str, pd.DataFrame], suite: str, regions: Sequen
     at = int(spread.sort_index().to_numpy().argmax())
     region, flight = spread.sort_index().index.to_list()[at]
     return str(region), str(flight)
+
+
+def plot_flight(flown: Trajectory, region: Region) -> Figure:
+    """Draw a flight over the map around it, and its height and speed over time.
+
+    Parameters
+    ----------
+    flown : Trajectory
+        In the region's CRS, as of `read_flight`.
+    region : Region
+        The map below it.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure of its own, with the attribution of the map. A notebook shows it.
+
+    Raises
+    ------
+    ConfigError
+        If these are no flight and no region, or the flight lies beside the map.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import sasgeo_bench as sgb
+    >>> with TemporaryDirectory() as folder:
+    ...     region = sgb.tiny_place(Path(folder)).region
+    >>> west, south, east, north = region.manifest.bounds_m
+    >>> corners = [[west, south, 100.0], [east, north, 100.0]]
+    >>> figure = Trajectory.of_angles(time_s=[0.0, 30.0], position_m=corners, yaw_deg=[0.0, 0.0]).plot(region)
+    >>> [chart.get_title("left") for chart in figure.axes]
+    ['map, north up', 'third axis (m)', 'speed (m/s)']
+    """
+    check_given(flown, Trajectory, "read_flight reads one from a log")
+    check_given(region, Region, "read_region reads one from its folder")
+    place_m = flown.position_m[:, :2]
+    if not ((place_m >= region.grid.bounds_m[:2]) & (place_m <= region.grid.bounds_m[2:])).all(axis=1).any():
+        raise ConfigError(
+            f"the flight lies beside the map {region.manifest.id}: read the region that it was flown over"
+        )
+    low, high = place_m.min(axis=0), place_m.max(axis=0)
+    row, col, rows, cols = window_around(region.grid, (low + high) / 2, max(200.0, 0.6 * float((high - low).max())))
+    layers = region.layers[:, row : row + rows, col : col + cols]
+    part = MapPart.of(layers, region.grid.window(row, col, rows, cols), region.manifest)
+    about = Page(
+        title=f"Flight over {region.manifest.title}",
+        facts=f"{flown.distance_m[-1]:.0f} m in {np.ptp(flown.time_s):.0f} s, {counted(len(flown), 'pose')}. Map of "
+        f"{region.manifest.extract.date}.",
+        data=region.manifest.attribution,
+    )
+    time_s = flown.time_s - flown.time_s[0]
+    speed_mps = np.hypot(*np.diff(place_m, axis=0).T) / np.diff(flown.time_s)
+    with styled():
+        figure = new_figure((1.7 * _ONE_INCHES, _ONE_INCHES + 1.2))
+        charts = figure.framed(about).subplot_mosaic([["map", "height"], ["map", "speed"]], width_ratios=(3, 2))
+        chart = charts["map"]
+        width_m, height_m = part.east_m - part.west_m, part.north_m - part.south_m
+        chart.imshow(part.colours, extent=(0, width_m, 0, height_m), interpolation="antialiased", alpha=0.75)
+        at_m = place_m - (part.west_m, part.south_m)
+        chart.plot(*at_m.T, color="white", lw=3.0)
+        chart.plot(*at_m.T, color=TRUE, lw=1.2)
+        chart.plot(*at_m[0], "^", ms=7, mfc=TRUE, mec="white")
+        chart.plot(*at_m[-1], "s", ms=5.5, mfc=TRUE, mec="white")
+        chart.set(xlim=(0, width_m), ylim=(0, height_m), aspect="equal", facecolor=HIDDEN)
+        without_ticks(chart)
+        scale_bar(chart, width_m, height_m)
+        chart.set_title("map, north up", fontsize=8.0)
+        charts["height"].plot(time_s, flown.position_m[:, 2], color=TRUE, lw=1.1)
+        charts["height"].set_title("third axis (m)", fontsize=8.0)
+        charts["speed"].plot((time_s[:-1] + time_s[1:]) / 2, speed_mps, color=TRUE, lw=1.1)
+        charts["speed"].set_title("speed (m/s)", fontsize=8.0)
+        charts["speed"].set_xlabel("time (s)")
+        for name in ("height", "speed"):
+            charts[name].grid(visible=True, color=FAINT, lw=0.6)
+        figure.arrange()
+    return figure
 
 
 def flight_map_pixels(task: Task, flight: str, views: Mapping[str, pd.DataFrame]) -> NDArray[np.uint8]:

@@ -291,12 +291,12 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
         except SasgeoError as error:
             lost.append(error)
             continue
+        predictions |= mine
         if task.manifest.is_of_flights:
             flights[name] = score_flights(*asked, mine, place_of=place_of)
             continue
         frames.append(score_task(*asked, mine, place_of=place_of))
         tasks[name] = task
-        predictions |= mine
     if not (frames or flights):
         raise lost[0]
     if lost:

@@ -3,7 +3,8 @@
 
 import datetime as dt
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -12,21 +13,24 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table, say
-from sasgeo_bench.cli.options import Options
+from sasgeo_bench.cli.console import print_table, said_after, say
+from sasgeo_bench.cli.options import ExtractFolders, Options, Out, OwnRegionFolders, takes
 from sasgeo_bench.core.errors import FlightError, counted
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.parquet import write_frame
-from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.progress import reporting, silent, tell
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, fit_profile, measure_drift, pair_run
 from sasgeo_bench.flights.drift_profile import write_drift_profile
 from sasgeo_bench.flights.log_odometry import LoggedRuns, read_runs
 from sasgeo_bench.flights.log_points import FlightLog, steps_m
 from sasgeo_bench.flights.log_units import SPEED_MPS, AngleUnit, HeightUnit, LogFacts, PlaceUnit, TimeUnit
-from sasgeo_bench.flights.logs import gaps_of, is_tum, read_flight, read_log, read_poses
-from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M
+from sasgeo_bench.flights.logs import SHORTEST_FLOWN_M, FlownPath, gaps_of, is_tum, read_log, read_poses
+from sasgeo_bench.flights.plans import MARGIN_M
 from sasgeo_bench.flights.trajectory import Axes, Trajectory, read_tum, write_tum
-from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.regions.region_files import MANIFEST, read_manifest, read_region
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 AxesFlag = Annotated[
     Axes | None,
@@ -36,22 +40,33 @@ AxesFlag = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class FlightOptions(Options):
-    """Flags of `read-flight`."""
+    """Flags of `import-flight`."""
 
     file: Annotated[
         Path,
         typer.Argument(
             help="GPX, KML, KMZ, CSV, RTKLIB .pos, ULog, DataFlash, .tlog, bag, MCAP, or TUM in the region's CRS"
         ),
-    ]
-    region: Annotated[Path | None, typer.Option(help="folder of a built region: cut the flight to it")] = None
-    tum: Annotated[Path | None, typer.Option(help="TUM file to write the stretch over the region into")] = None
-    height_m: Annotated[float | None, typer.Option(help="height above the ground to keep, instead of the log's")] = None
-    least_m: Annotated[
-        float | None, typer.Option(help=f"shortest stretch that is taken, metres; default: {SHORTEST_M:g}")
+    ] = field(kw_only=False)
+    region: Annotated[
+        str | None, typer.Option(help="region that was flown over: id, or own file; its queries are drawn")
     ] = None
-    margin_m: Annotated[
-        float | None, typer.Option(help=f"least distance from ground without a map, metres; default: {MARGIN_M:g}")
+    suite: Annotated[str, typer.Option(help="suite of flights whose views are drawn along it")] = "flight-clean"
+    prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
+        None
+    )
+    seed: Annotated[int, typer.Option(min=0, help="public random seed")] = 0
+    extracts: ExtractFolders = None
+    region_files: OwnRegionFolders = None
+    out: Out = Path("out")
+    tum: Annotated[Path | None, typer.Option(help="TUM file to write the stretch over the region into")] = None
+    height: Annotated[
+        float | None, typer.Option("--height", "--height-m", help="above the ground, metres, instead of the log's")
+    ] = None
+    dem: Annotated[Path | None, typer.Option(help="heights of the ground above the sea, a GeoTIFF")] = None
+    takeoff_height: Annotated[float | None, typer.Option(help="altitude of the place of take-off, metres")] = None
+    least_m: Annotated[
+        float | None, typer.Option(help=f"shortest stretch that is taken, metres; default: {SHORTEST_FLOWN_M:g}")
     ] = None
     speed_mps: Annotated[
         float | None, typer.Option(help=f"even speed of a log without times, m/s; default: {SPEED_MPS:g}")
@@ -81,35 +96,89 @@ class FlightOptions(Options):
             axes=self.axes,
             speed_mps=self.speed_mps,
             vehicle=self.vehicle,
+            takeoff_m=self.takeoff_height,
+            dem=self.dem,
         )
 
+    @property
+    def flown(self) -> FlownPath:
+        """Return the flight."""
+        least_m = SHORTEST_FLOWN_M if self.least_m is None else self.least_m
+        return FlownPath(file=self.file, facts=self.facts, height_m=self.height, least_m=least_m)
 
-def read_flight_command(flight: FlightOptions) -> None:
-    """Read a flight log and print what was read, in which units; cut it to a region, and write that as TUM."""
-    _check_outputs([flight.file], [flight.tum] if flight.tum else [])
-    if flight.region is not None:
-        region = read_region(flight.region)
-        flown = read_flight(
-            flight.file,
-            region,
-            margin_m=MARGIN_M if flight.margin_m is None else flight.margin_m,
-            least_m=SHORTEST_M if flight.least_m is None else flight.least_m,
-            height_m=flight.height_m,
-            facts=flight.facts,
-        )
-        say(f"over {region.manifest.id}: {_summary(flown)}")
-        if flight.tum is not None:
-            write_tum(flown, flight.tum)
-            tell(f"wrote {flight.tum}")
-        return
-    for name in ("tum", "least_m", "margin_m"):
-        if getattr(flight, name) is not None:
-            raise FlightError(f"--{name.replace('_', '-')} needs --region: it is about the stretch over a region")
-    if is_tum(flight.file):
-        flown = read_poses(flight.file, flight.facts, height_m=flight.height_m)
-        say("\n".join((_summary(flown), *gaps_of(flown.time_s))))
-    else:
-        _show(read_log(flight.file, flight.facts, height_m=flight.height_m), flight.speed_mps or SPEED_MPS)
+
+@takes(FlightOptions)
+def import_flight(options: FlightOptions) -> tuple[Path, ...]:
+    """Read the log of a flight, say what was read of which columns in which units, and draw its queries on a region.
+
+    Views are drawn from the map along the longest stretch over it, in the order in which they were flown; the truth is
+    the log. `run` and `score` work as on any task of flights.
+
+    Returns
+    -------
+    tuple of Path
+        Task folders, `out/tasks/<suite>/<region>`; none without a region.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such suite or region, or what the flight sees cannot be asked.
+    ExtractError
+        If the region cannot be built since its extract is missing.
+    FlightError
+        If the log is not sound, needs a unit, has no height, or leaves the region.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> sgb.import_flight("nowhere.gpx", region="vaduz")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.core.errors.FlightError: there is no flight log nowhere.gpx: check the path
+    """
+    _check_outputs([options.file], [options.tum] if options.tum else [])
+    if options.region is None:
+        for name in ("tum", "least_m", "dem", "takeoff_height"):
+            if getattr(options, name) is not None:
+                raise FlightError(f"--{name.replace('_', '-')} needs --region: it is about the stretch over a region")
+        if is_tum(options.file):
+            poses = read_poses(options.file, options.facts, height_m=options.height)
+            options.say("\n".join((_summary(poses), *gaps_of(poses.time_s))))
+        else:
+            log = read_log(options.file, options.facts, height_m=options.height)
+            for line in _lines(log, options.speed_mps or SPEED_MPS):
+                options.say(line)
+        return ()
+    flown = options.flown
+    built = Path(options.region, MANIFEST)
+    wanted = TaskRequest(
+        suites=(options.suite,),
+        regions=(read_manifest(built.parent).id if built.is_file() else options.region,),
+        count=1,
+        seed=options.seed,
+        group=PriorGroup.parse(options.prior) if options.prior else None,
+        extract_folders=tuple(options.extracts or ()),
+        region_folders=tuple(options.region_files or ()),
+        out=options.out,
+        flown=flown,
+    )
+    (request,) = plan_requests(wanted)
+    tasks = make_tasks(request)
+    for task in tasks:
+        options.say(task.folder)
+    if options.tum is not None:
+        region = read_region(options.out / "regions" / request.region.id, with_layers=False)
+        with reporting(silent):  # its lines were told before
+            stretch = flown.over(region, margin_m=MARGIN_M)
+        write_tum(stretch, options.tum)
+        tell(f"wrote {options.tum}: {_summary(stretch)}")
+    return tuple(task.folder for task in tasks)
+
+
+def import_flight_command(options: FlightOptions) -> None:
+    """Read the log of a flight and say what was read, in which units; draw its queries on a region."""
+    with said_after() as say_later:
+        import_flight(**vars(options) | {"say": say_later})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,24 +276,23 @@ def _summary(flown: Trajectory) -> str:
     )
 
 
-def _show(log: FlightLog, speed_mps: float) -> None:
-    """Print what was read of a log."""
+def _lines(log: FlightLog, speed_mps: float) -> Iterator[str]:
+    """Yield what was read of a log."""
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
     lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
-    say(f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}")
+    yield f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}"
     if log.start_s is not None:
-        say(f"starts at {dt.datetime.fromtimestamp(log.start_s, tz=dt.UTC).isoformat(timespec='milliseconds')}")
-    for line in (*gaps_of(log.time_s), *log.notes):
-        say(line)
+        yield f"starts at {dt.datetime.fromtimestamp(log.start_s, tz=dt.UTC).isoformat(timespec='milliseconds')}"
+    yield from (*gaps_of(log.time_s), *log.notes)
     for name in ("height_m", "altitude_m", "yaw_deg", "pitch_deg", "roll_deg"):
         values = getattr(log, name)
         if values is not None:
             what, _, unit = name.partition("_")
-            say(f"{what} from {values.min():.1f} to {values.max():.1f} {unit}")
+            yield f"{what} from {values.min():.1f} to {values.max():.1f} {unit}"
     if log.time_s is None:
         tell(f"no times: a flight has an even speed (--speed-mps, {speed_mps:g} m/s)")
     if log.height_m is None:
-        tell("no height above the ground: a flight needs --height-m")
+        tell("no height above the ground: a flight needs --height")
 
 
 def _read_lengths(text: str) -> list[float]:

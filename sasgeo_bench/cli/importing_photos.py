@@ -2,7 +2,7 @@
 """Commands that make tasks of a user's own pictures and masks: import-photos, import-masks."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -18,6 +18,7 @@ from sasgeo_bench.observing.import_masks import import_masks as masks_imported
 from sasgeo_bench.observing.import_photos import GROUP, SUITE, ImportRequest
 from sasgeo_bench.observing.import_photos import import_photos as imported_by
 from sasgeo_bench.observing.masks import read_legend
+from sasgeo_bench.observing.photo_flights import OdometerName
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights
 from sasgeo_bench.tasks.query import PriorGroup
@@ -58,6 +59,10 @@ class ImportPhotosOptions(PosedOptions):
         kw_only=False
     )
     name: Annotated[str, typer.Option(help="suite of the task")] = SUITE
+    odometry: Annotated[
+        OdometerName,
+        typer.Option(help="of flights: the truth with drawn errors, or found by matching pictures (visual)"),
+    ] = "drawn"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +111,7 @@ def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
         ...
     sasgeo_bench.core.errors.ConfigError: heights come from one source: give --height, --dem or --takeoff-height alone
     """
-    tasks = imported_by(_request(options, options.pictures))
+    tasks = imported_by(replace(_request(options, options.pictures), odometry=options.odometry))
     for task in tasks:
         options.say(task.folder)
     return tasks

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from sasgeo_bench.boards.board_files import BOARD, read_board_manifest, read_scores
 from sasgeo_bench.boards.cases import case_pixels, count_cases, count_turned, sample_cases, write_png
+from sasgeo_bench.boards.flight_page import flight_page
 from sasgeo_bench.boards.flight_plots import flight_map_pixels
 from sasgeo_bench.boards.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
 from sasgeo_bench.boards.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
@@ -20,6 +21,7 @@ from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
 from sasgeo_bench.cli.targets import find_task, is_split, no_target
 from sasgeo_bench.core.errors import ConfigError, counted
+from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import read_overview
@@ -234,6 +236,11 @@ def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
     path = _sheet(out, cases.entry.name, str(row["query_id"]))
     write_png(path, flight_map_pixels(task, str(row["query_id"]), views))
     say(f"map of {'the worst flight' if query is None else 'the flight'}: {path}")
+    playing = path.with_suffix(".html")
+    text = flight_page(task, str(row["query_id"]), cases.entry.name, cases.flights[key].views, cases.predictions)
+    with fresh_file(playing, mend="name another --out, or free some space") as scratch:
+        scratch.write_text(text, encoding="utf-8")
+    say(f"page that plays it: {playing}")
     return query is not None
 
 

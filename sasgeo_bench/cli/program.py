@@ -76,7 +76,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "fetch": "publishing",
     },
     "Flights": {
-        "read-flight": "flights",
+        "import-flight": "flights",
         "measure-drift": "flights",
         "replay": "replaying",
     },
@@ -95,6 +95,7 @@ ALIASES: Final = {
     **{f"new-{kind}": ("new", kind) for kind in ("matcher", "tracker", "segmenter")},
     **{f"check-{kind}": ("check", "--kind", kind) for kind in ("matcher", "tracker", "segmenter")},
     "validate": ("verify",),
+    "read-flight": ("import-flight",),
     "compare-ageing": ("measure-ageing", "--compare"),
 }
 

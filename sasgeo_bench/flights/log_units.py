@@ -25,8 +25,9 @@ HIGHEST_M: Final = 10_000.0
 RANGES: Final = MappingProxyType(
     {
         "--speed-mps": (0.1, FASTEST_MPS),
-        "--height-m": (LOWEST_M, HIGHEST_M),
+        "--height": (LOWEST_M, HIGHEST_M),
         "--least-m": (1.0, 1e6),
+        "--takeoff-height": (-500.0, 9000.0),
         "--margin-m": (0.0, 1e6),
     }
 )
@@ -84,6 +85,10 @@ class LogFacts:
         Even speed of a log without times, 0.1 to 100 m/s; by default 10 m/s.
     vehicle : int, optional
         System id of the vehicle in a telemetry log of several.
+    takeoff_m : float, optional
+        Altitude of the place of take-off, metres above the sea: heights are altitudes less it.
+    dem : Path, optional
+        GeoTIFF of the ground's heights above the sea: heights are altitudes less it.
 
     Raises
     ------
@@ -98,6 +103,8 @@ class LogFacts:
     axes: Axes | None = None
     speed_mps: float | None = None
     vehicle: int | None = None
+    takeoff_m: float | None = None
+    dem: Path | None = None
 
     def __post_init__(self) -> None:
         for quantity in UNITS:
@@ -107,6 +114,7 @@ class LogFacts:
         if self.axes is not None and self.axes not in AXES:
             raise FlightError(f"axes must be one of {', '.join(AXES)}, got {self.axes!r}")
         check_within("--speed-mps", self.speed_mps)
+        check_within("--takeoff-height", self.takeoff_m)
 
     def unit(self, quantity: str) -> str | None:
         """Return the unit that the user states for a quantity."""
@@ -130,10 +138,10 @@ class LogFacts:
 def check_within(option: str, value: float | None) -> None:
     """Raise `FlightError` if a number that was given lies outside of what its option takes.
 
-    >>> check_within("--height-m", float("nan"))
+    >>> check_within("--height", float("nan"))
     Traceback (most recent call last):
         ...
-    sasgeo_bench.core.errors.FlightError: --height-m must be a number from 5 to 10000, got nan
+    sasgeo_bench.core.errors.FlightError: --height must be a number from 5 to 10000, got nan
     """
     least, most = RANGES[option]
     if value is not None and not least <= value <= most:

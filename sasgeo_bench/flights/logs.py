@@ -15,7 +15,7 @@ import pyproj
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.core.errors import CameraError, FlightError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
@@ -28,9 +28,11 @@ from sasgeo_bench.flights.log_ulog import read_ulog
 from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.geometry.projection import from_lonlat
-from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region import Manifest, Region
+from sasgeo_bench.sensing.ground import read_dem
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -49,6 +51,8 @@ _READERS: Final = MappingProxyType(
 _TABLES: Final = (".csv", ".pos")
 _TELEMETRY: Final = ".tlog"
 SUFFIXES: Final = (*_READERS, _TELEMETRY, *BAGS, *_TABLES, *_TUM)
+SHORTEST_FLOWN_M: Final = 200.0  # of a flight whose views are drawn: five or so
+_GROUND_CELL_M: Final = 10.0  # of heights of the ground
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
@@ -69,14 +73,16 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
     >>> log.lat_deg.tolist(), log.height_m.tolist(), log.time_s
     ([47.14, 47.15], [80.0, 80.0], None)
     """
-    check_within("--height-m", height_m)
+    check_within("--height", height_m)
     facts = facts or LogFacts()
+    if sum(item is not None for item in (height_m, facts.takeoff_m, facts.dem)) > 1:
+        raise FlightError("heights come from one source: give --height, --dem or --takeoff-height alone")
     log = _read(path, facts, has_height=height_m is not None)
     if facts.speed_mps is not None and log.time_s is not None:
         raise _meaningless(path, "has times", "--speed-mps")
     if height_m is None:
         return log
-    notes = (*log.notes, f"height: {height_m:g} m throughout, as --height-m says")
+    notes = (*log.notes, f"height: {height_m:g} m throughout, as --height says")
     return replace(log, height_m=np.full(len(log), height_m), notes=notes)
 
 
@@ -111,11 +117,13 @@ def _meaningless(path: Path, why: str, option: str) -> FlightError:
 
 def read_poses(path: Path, facts: LogFacts | None = None, *, height_m: float | None = None) -> Trajectory:
     """Read a TUM file as `read_log` reads logs, with its axes and the height that is kept."""
-    check_within("--height-m", height_m)
+    check_within("--height", height_m)
     facts = facts or LogFacts()
     facts.check_untold(path)
     if facts.speed_mps is not None:
         raise _meaningless(path, "has times", "--speed-mps")
+    if facts.takeoff_m is not None or facts.dem is not None:
+        raise _meaningless(path, "has heights", "--dem and --takeoff-height")
     flown = read_tum(path, axes=facts.axes)
     return flown if height_m is None else _at_height(flown, height_m)
 
@@ -219,7 +227,7 @@ def _over(log: FlightLog | None, path: Path, region: Region, cut: _Cut) -> Traje
         for line in (*log.notes, *gaps_of(log.time_s)):
             tell(line)
         _check_near(log, path, region)
-        logged = _on_grid(log, path, region.manifest.epsg, (facts and facts.speed_mps) or SPEED_MPS)
+        logged = _on_grid(log, path, region.manifest, facts or LogFacts())
     flown = _resampled(logged, path, step_s)
     is_known = np.ones(len(flown) - 1, dtype=bool)
     if log is None or log.time_s is not None:
@@ -236,7 +244,7 @@ class FlownPath:
     file: Path
     facts: LogFacts = field(default_factory=LogFacts)
     height_m: float | None = None
-    least_m: float = 200.0  # five views or so
+    least_m: float = SHORTEST_FLOWN_M
 
     def __post_init__(self) -> None:
         if not self.file.is_file():
@@ -245,7 +253,8 @@ class FlownPath:
     @cached_property
     def key(self) -> str:
         """Return the hash of all that the path follows from."""
-        asked = [sha256_of(self.file), self.file.name, asdict(self.facts), self.height_m, self.least_m]
+        files = [sha256_of(self.file), None if self.facts.dem is None else sha256_of(self.facts.dem)]
+        asked = [*files, self.file.name, asdict(self.facts) | {"dem": None}, self.height_m, self.least_m]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 
     @cached_property
@@ -277,22 +286,46 @@ def _check_near(log: FlightLog, path: Path, region: Region) -> None:
         raise FlightError(plain(message))
 
 
-def _on_grid(log: FlightLog, path: Path, epsg: int, speed_mps: float) -> Trajectory:
-    """Return the points of a log in a projected CRS; without a heading yaw is 0."""
-    up_m = log.height_m
+def _above_ground(log: FlightLog, path: Path, en_m: Floats, manifest: Manifest, facts: LogFacts) -> Floats | None:
+    """Return heights above the ground of the points of a log, shape (N,); 0 beside the ground that is known."""
+    if facts.takeoff_m is None and facts.dem is None:
+        return log.height_m
+    if log.altitude_m is None:
+        raise FlightError(f"{path.name} has no altitude, from which --dem and --takeoff-height count: leave them out")
+    if log.altitude_of == "ellipsoid":
+        raise FlightError(
+            f"altitudes of {path.name} count from the ellipsoid, where --dem and --takeoff-height do from the sea: say "
+            "--height"
+        )
+    tell(f"heights: altitudes of {plain(path.name)}, taken to be above the sea, less those of the ground")
+    if facts.dem is None:
+        return log.altitude_m - (facts.takeoff_m or 0.0)
+    grid = Grid.from_bounds(*manifest.bounds_m, cell_size_m=_GROUND_CELL_M, epsg=manifest.epsg)
+    try:
+        ground_m = read_dem(facts.dem, grid).heights_m(en_m)
+    except CameraError as error:
+        raise FlightError(str(error)) from error
+    return np.nan_to_num(log.altitude_m - ground_m, nan=0.0)
+
+
+def _on_grid(log: FlightLog, path: Path, manifest: Manifest, facts: LogFacts) -> Trajectory:
+    """Return the points of a log in a map's CRS; without a heading yaw is 0."""
+    epsg = manifest.epsg
+    en_m = np.stack(from_lonlat(epsg).transform(log.lon_deg, log.lat_deg), axis=1)
+    en_m = np.nan_to_num(en_m, nan=_FAR_M, posinf=_FAR_M, neginf=-_FAR_M)
+    up_m = _above_ground(log, path, en_m, manifest, facts)
     if up_m is not None and (highest_m := float(up_m.max())) < LOWEST_M:
         raise FlightError(
             f"{path.name} never leaves the ground: {highest_m:.1f} m above it at most, {LOWEST_M:g} m are needed: take "
-            "another log, or say a height, as in --height-m 100"
+            "another log, or say a height, as in --height 100"
         )
     if up_m is None:
         why = "" if log.altitude_m is None else ", and its altitudes do not count from there"
-        raise FlightError(f"{path.name} has no height above the ground{why}: say one, as in --height-m 100")
-    en_m = np.stack(from_lonlat(epsg).transform(log.lon_deg, log.lat_deg), axis=1)
-    en_m = np.nan_to_num(en_m, nan=_FAR_M, posinf=_FAR_M, neginf=-_FAR_M)
+        more = "" if log.altitude_m is None else ", or that of the ground by --dem or --takeoff-height"
+        raise FlightError(f"{path.name} has no height above the ground{why}: say one, as in --height 100{more}")
     time_s = log.time_s
     if time_s is None:
-        time_s = np.append(0.0, np.cumsum(steps_m(log.lon_deg, log.lat_deg))) / speed_mps
+        time_s = np.append(0.0, np.cumsum(steps_m(log.lon_deg, log.lat_deg))) / (facts.speed_mps or SPEED_MPS)
     if log.yaw_deg is None:
         return Trajectory.of_angles(time_s=time_s, position_m=np.column_stack([en_m, up_m]), yaw_deg=np.zeros(len(log)))
     # A bearing in the grid is one from true north less the meridian convergence.
@@ -359,7 +392,7 @@ def _longest_inside(
         message = (
             f"{path.name} leaves {region.manifest.id}: of {along_m[-1]:.0f} m the longest stretch over mapped ground, "
             f"{margin_m:.0f} m from its edge and in the air, has {longest_m:.0f} m, {least_m:g} m are needed: take "
-            "another region, or a smaller --margin-m or --least-m"
+            "another region, or a smaller --least-m"
         )
         raise FlightError(plain(message))
     run = slice(starts[best], ends[best] + 1)

@@ -8,8 +8,9 @@ import warnings
 import zlib
 from array import array
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Final, Literal, Self
+from typing import TYPE_CHECKING, Final, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,11 @@ from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import bearing_deg
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from sasgeo_bench.regions.region import Region
 
 Floats = NDArray[np.float64]
 
@@ -142,6 +148,11 @@ class Trajectory:
         position = np.stack([np.interp(times, self.time_s, axis) for axis in self.position_m.T], axis=1)
         turned = Slerp(self.time_s, self.rotation)(times) if len(self) > 1 else self.rotation
         return type(self)(time_s=times, position_m=position, quaternion_xyzw=turned.as_quat())
+
+    def plot(self, region: "Region") -> "Figure":
+        """Draw the flight over a map in one call; see `sgb.plot_flight`."""
+        # By its public name: the drawing stands below in the order of folders
+        return cast("Figure", import_module("sasgeo_bench").plot_flight(self, region))
 
     def span_text(self) -> str:
         """Return from when to when it goes, for messages; times may count from 1970, so to the millisecond."""

@@ -16,12 +16,10 @@ import numpy as np
 from sasgeo_bench.core.errors import ConfigError, SasgeoError, counted, named
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import NAME, plain
-from sasgeo_bench.flights.drift_profile import load_profile
-from sasgeo_bench.flights.odometry import Odometry, draw_odometry
-from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Prior
+from sasgeo_bench.observing.photo_flights import GAP_S, ODOMETERS, Odometer, OdometerName, flights_of, trajectory_of
 from sasgeo_bench.observing.picture_poses import PoseFacts, PoseTable
-from sasgeo_bench.observing.pictures import averaged, list_pictures, names_of, see
+from sasgeo_bench.observing.pictures import Sight, averaged, fitted, list_pictures, names_of, see_whole
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.observing.posed_pictures import (
     Heights,
@@ -58,13 +56,9 @@ from sasgeo_bench.tasks.task_files import Task, TaskOrigin, TruthManifest
 SUITE: Final = "photos"
 FLIGHTS: Final = "-flights"  # after the name of a suite: the same pictures as flights
 GROUP: Final = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.10)
-GAP_S: Final = 30.0  # between two pictures, which ends a flight
-LEAST_FRAMES: Final = 3
-DRIFT: Final = "vio-mono"  # measured profile of the odometer
 _VERSION: Final = 1
 _MOST_PX: Final = 768  # of a side of a picture in a task, as in the suites
 _BLOCK_M: Final = 1000.0
-_FASTEST_MPS: Final = 40.0  # of a drone between two pictures
 _SHOWN: Final = 3
 _CELLS: Final = 16  # of which the side of a view is a multiple, so that a board has few kinds of views
 _STEPS_M: Final = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # of standard deviations, which are rounded up for scoring
@@ -94,6 +88,8 @@ class ImportRequest:
         Standard deviation of places, of pictures whose file or row does not state it; by default that of GPS.
     group : PriorGroup
         How much is known before.
+    odometry : {"drawn", "visual"}
+        Of flights: the truth with drawn errors, or what `sensing.visual_odometry` makes of the pictures.
     seed : int
         Of priors and of the odometer's errors.
 
@@ -112,6 +108,7 @@ class ImportRequest:
     heights: Heights = field(default_factory=Heights)
     sigma_m: float | None = None
     group: PriorGroup = GROUP
+    odometry: OdometerName = "drawn"
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -128,9 +125,13 @@ class ImportRequest:
 
 @dataclass(frozen=True, kw_only=True)
 class Perceived:
-    """What a query holds of a picture: evidence, and the picture itself with labels, unless others looked at it."""
+    """What a query holds of a picture: evidence, and the picture itself with labels, unless others looked at it.
+
+    `sight` is the whole picture, for an odometer.
+    """
 
     evidence: Evidence
+    sight: Sight | None = None
     frames: tuple[Frame, ...] = ()
     labels: tuple[FrameLabels, ...] = ()
 
@@ -191,11 +192,15 @@ def write_tasks(
     flights = flights_of([one for one in found.pictures if one.name not in writer.failed])
     if flights:
         flown = [one for flight in flights for one in flight]
+        odometer = ODOMETERS[request.odometry]()
         tell(
-            f"{counted(len(flights), 'flight')} of {counted(len(flown), 'picture')}: a gap of {GAP_S:g} s ends one; "
-            f"the odometer drifts as {DRIFT} was measured to"
+            f"{counted(len(flights), 'flight')} of {counted(len(flown), 'picture')}: a gap of {GAP_S:g} s ends one. "
+            f"{odometer.words}"
         )
-        tasks.append(writer.put(f"{request.name}{FLIGHTS}", partial(writer.flights, flights), flown))
+        pairs = partial(writer.flights, flights, odometer)
+        tasks.append(writer.put(f"{request.name}{FLIGHTS}", pairs, flown, odometer.words))
+        if odometer.report():
+            tell(odometer.report())
     writer.tell_failed()
     return tuple(tasks)
 
@@ -262,28 +267,6 @@ def _tell(found: PosedPictures) -> None:
         tell(f"{len(lenses)} cameras: {', '.join(f'{plain(lens)} ({count})' for lens, count in lenses.items())}")
 
 
-def flights_of(pictures: Sequence[PosedPicture]) -> list[list[PosedPicture]]:
-    """Return the flights among pictures, each in order of time, of `LEAST_FRAMES` at least.
-
-    A flight ends where the next picture is `GAP_S` later, is of another camera, or could not be reached in time.
-    """
-    timed = sorted((one for one in pictures if one.time_s is not None), key=lambda one: (one.time_s or 0.0, one.name))
-    found: list[list[PosedPicture]] = []
-    for one in timed:
-        last = found[-1][-1] if found else None
-        if last is None or not _follows(one, last):
-            found.append([one])
-        elif one.time_s != last.time_s:  # clocks of cameras count seconds: of two pictures in one the first is taken
-            found[-1].append(one)
-    return [flight for flight in found if len(flight) >= LEAST_FRAMES]
-
-
-def _follows(one: PosedPicture, last: PosedPicture) -> bool:
-    after_s = (one.time_s or 0.0) - (last.time_s or 0.0)
-    way_m = math.dist(one.position_m[:2], last.position_m[:2])
-    return after_s < GAP_S and one.lens == last.lens and way_m <= _FASTEST_MPS * max(after_s, 1.0)
-
-
 Pairs = Iterator[tuple[Query, Truth]]
 
 
@@ -322,18 +305,16 @@ class TaskWriter:
         for why, names in self.failed_by.items():
             tell(f"left out: {named(names, 'picture')} {why}")
 
-    def put(
-        self, suite: str, pairs: Callable[[str], Iterator[tuple[Query, Truth]]], of: Sequence[PosedPicture]
-    ) -> Task:
-        """Write one task."""
-        made = put_task(pairs(suite), self._origin(suite, of), self._hidden(len(of)), out=self.request.out)
+    def put(self, suite: str, pairs: Callable[[str], Pairs], of: Sequence[PosedPicture], more: str = "") -> Task:
+        """Write one task; `more` is a sentence on what it is."""
+        made = put_task(pairs(suite), self._origin(suite, of, more), self._hidden(len(of)), out=self.request.out)
         tell(f"{suite} on {self.state.region}: {counted(made.manifest.queries, 'query', 'queries')} in {made.folder}")
         return made
 
     def _hidden(self, count: int) -> TruthManifest:
         return TruthManifest.model_validate(seed_record(self.request.seed) | {"count": count})
 
-    def _origin(self, suite: str, pictures: Sequence[PosedPicture]) -> TaskOrigin:
+    def _origin(self, suite: str, pictures: Sequence[PosedPicture], more: str) -> TaskOrigin:
         sigmas_m = [one.sigma_m for one in pictures]
         by = "their files" if self.request.poses is None else self.request.poses.name
         searched = self.request.group.words.removeprefix("searched: ")
@@ -343,7 +324,7 @@ class TaskWriter:
             title=f"Pictures of one's own ({suite})",
             what=f"{counted(len(pictures), 'picture')} with poses by {plain(by)}, searched: {searched}. Truths have a "
             f"standard deviation of {min(sigmas_m):.1f} to {max(sigmas_m):.1f} m: success within less than two of "
-            "them, rounded up, is not scored.",
+            f"them, rounded up, is not scored. {more}".rstrip(),
             separates="What a method does on one's own pictures from what it does on others.",
             falsifier="none",
             strength_unit=TRUTH_SIGMA,
@@ -367,43 +348,52 @@ class TaskWriter:
         for one in sorted(pictures, key=lambda one: seeds[one.name].digest("query")):
             own = seeds[one.name]
             prior = make_prior(one.pose, self.request.group, rng=own.rng("prior"))
-            pair = self._pair(one, suite, _Asked(own.digest("query").hex()[:24], prior, own))
-            if pair is not None:
+            seen = self._perceived(one)
+            if seen is not None:
                 count += 1
-                yield pair
+                yield self._pair(one, suite, _Asked(own.digest("query").hex()[:24], prior, own), seen)
         if not count:
             self.tell_failed()
             raise _nothing(self.request.pictures, self.failed_by)
 
-    def flights(self, flights: Sequence[Sequence[PosedPicture]], suite: str) -> Pairs:
+    def flights(self, flights: Sequence[Sequence[PosedPicture]], odometer: Odometer, suite: str) -> Pairs:
         """Yield the pictures of flights in the order of the ids, with what an odometer says of the way to each."""
         group = self.request.group
         blank = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=group.scale_sigma)
         by_id = {self._seeds(suite).digest("flight", one[0].name).hex()[:SEQUENCE_DIGITS]: one for one in flights}
         for flight, pictures in sorted(by_id.items()):
             seeds = self._seeds(suite).under("flight", pictures[0].name)
-            flown = _trajectory(pictures)
-            steps = draw_odometry(flown, load_profile(DRIFT), rng=seeds.rng("odometry"))
+            flown = trajectory_of(pictures)
+            odometer.begin(pictures, seeds.rng("odometry"))
+            before: Sight | None = None
             for frame, one in enumerate(pictures):
-                prior = make_prior(one.pose, group, rng=seeds.rng("prior")) if frame == 0 else blank
+                seen = self._perceived(one)
+                after = None if seen is None else seen.sight
+                prior, step = blank, Step(sequence_id=flight, frame=frame)
+                if frame == 0:
+                    prior = make_prior(one.pose, group, rng=seeds.rng("prior"))
+                elif (moved := odometer.increment(frame, before, after)) is not None:
+                    step = replace(step, increment=moved.increment, covariance=moved.covariance)
                 told = {
                     "distance_m": round(float(flown.distance_m[frame]), 1),
                     "time_s": round(float(flown.time_s[frame]), 2),
                     "is_seen": 1.0,
                 }
-                step = _step(flight, frame, steps)
-                pair = self._pair(one, suite, _Asked(view_id(flight, frame), prior, seeds, step, told))
-                if pair is not None:
-                    yield pair
+                if seen is not None:
+                    yield self._pair(one, suite, _Asked(view_id(flight, frame), prior, seeds, step, told), seen)
+                before = after
 
-    def _pair(self, one: PosedPicture, suite: str, asked: _Asked) -> tuple[Query, Truth] | None:
-        """Return the query and truth of a picture; None, and the reason kept, if it cannot be decoded."""
+    def _perceived(self, one: PosedPicture) -> Perceived | None:
+        """Return what a query holds of a picture; None, and the reason kept, if it cannot be decoded."""
         try:
-            seen = self._pictured(one) if self.perceive is None else self.perceive(one)
+            return self._pictured(one) if self.perceive is None else self.perceive(one)
         except SasgeoError as error:
             why = f"that cannot be decoded ({reason_of(error, one.picture.path)})"
             self.failed_by.setdefault(why, []).append(one.name)
             return None
+
+    def _pair(self, one: PosedPicture, suite: str, asked: _Asked, seen: Perceived) -> tuple[Query, Truth]:
+        """Return the query and truth of a picture."""
         taken = one.picture.taken_at
         query = Query(
             query_id=asked.query_id,
@@ -456,20 +446,28 @@ class TaskWriter:
 
     def _pictured(self, one: PosedPicture) -> Perceived:
         """Return a picture of which nothing is seen yet."""
-        sight = see(one.picture)
-        factor = math.ceil(max(sight.image.shape) / _MOST_PX)
-        image = sight.image if factor < 2 else averaged(sight.image, factor)
-        east_m, north_m = sight.middle_m
+        whole = see_whole(one.picture)
         height_m = 0.0 if one.picture.camera is None else one.position_m[2]
-        frame = Frame(
-            picture=encode_webp(image.rgb),
-            camera=image.camera.moved(east_m=-east_m, north_m=-north_m),
+        believed = replace(
+            whole.image,
             height_sigma_m=round(height_m * one.picture.scale_sigma, 2),
             attitude_sigma_deg=1.0 if one.picture.camera is not None else 0.0,
         )
+        sight = fitted(replace(whole, image=believed))
+        factor = math.ceil(max(sight.image.shape) / _MOST_PX)
+        image = sight.image if factor < 2 else averaged(sight.image, factor)
+        east_m, north_m = sight.middle_m
+        frame = Frame(
+            picture=encode_webp(image.rgb),
+            camera=image.camera.moved(east_m=-east_m, north_m=-north_m),
+            height_sigma_m=image.height_sigma_m,
+            attitude_sigma_deg=image.attitude_sigma_deg,
+        )
         size_cells = view_cells(sight.size_cells)
         evidence = unseen(self.state.classes, size_cells, sight.cell_size_m)
-        return Perceived(evidence=evidence, frames=(frame,), labels=(self._labels(image),))
+        return Perceived(
+            evidence=evidence, sight=replace(whole, image=believed), frames=(frame,), labels=(self._labels(image),)
+        )
 
     def _density(self, one: PosedPicture, evidence: Evidence) -> float:
         """Return the share of a view's cells in which the map shows a road, building, water or other drawn feature."""
@@ -488,25 +486,3 @@ class TaskWriter:
 def view_cells(most: int) -> int:
     """Return the cells along a side of a view that has at most so many: a multiple of a few, 16 at least."""
     return max(_CELLS, most // _CELLS * _CELLS)
-
-
-def _trajectory(pictures: Sequence[PosedPicture]) -> Trajectory:
-    """Return the way of the middles of views, as an odometer of the views sees it."""
-    begin_s = pictures[0].time_s or 0.0
-    return Trajectory.of_angles(
-        time_s=[(one.time_s or 0.0) - begin_s for one in pictures],
-        position_m=[[one.pose.easting_m, one.pose.northing_m, one.position_m[2]] for one in pictures],
-        yaw_deg=[one.pose.yaw_deg for one in pictures],
-    )
-
-
-def _step(flight: str, frame: int, steps: Odometry) -> Step:
-    if frame == 0 or steps.is_lost[frame - 1]:
-        return Step(sequence_id=flight, frame=frame)
-    at = frame - 1
-    return Step(
-        sequence_id=flight,
-        frame=frame,
-        increment=(float(steps.right_m[at]), float(steps.up_m[at]), float(steps.yaw_deg[at])),
-        covariance=tuple(steps.covariance[at].ravel().tolist()),
-    )

@@ -26,7 +26,7 @@ from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.grid import utm_epsg
-from sasgeo_bench.geometry.pose import Pose, bearing_deg, rotation
+from sasgeo_bench.geometry.pose import Pose, bearing_deg
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.regions.layers import find_bands, selected
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
@@ -267,17 +267,9 @@ def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
         heading_deg=sensor.yaw_deg if by else None,
         heading_by=by,
         scale_sigma=0.10,
-        camera=above_origin(sensor),
+        camera=sensor.above_origin(),
         height_m=height_m,
     )
-
-
-def above_origin(camera: Camera) -> Camera:
-    """Return a camera above the origin, in axes in which its picture's up is north."""
-    turn = np.eye(3)
-    turn[:2, :2] = rotation(camera.yaw_deg)
-    a, b, c, d, e, f, g, h, i = (camera.matrix @ turn).ravel().round(15).tolist()
-    return replace(camera, east_m=0.0, north_m=0.0, rotation=(a, b, c, d, e, f, g, h, i))
 
 
 def _georeferenced(path: Path) -> OwnPicture | None:
@@ -349,7 +341,7 @@ class _Ground:
 
 
 def see(picture: OwnPicture, told: Told | None = None) -> Sight:
-    """Decode a picture, or the part of it that a view needs.
+    """Decode a picture, or the part of it that a view needs, with pixels no finer than a segmenter needs.
 
     Raises
     ------
@@ -358,10 +350,26 @@ def see(picture: OwnPicture, told: Told | None = None) -> Sight:
     CameraError
         If it shows less ground than `LEAST_M` a side.
     """
-    told = told or Told()
-    if picture.camera is None and picture.position_by == "georeference":
-        return _seen_from_above(*_read_georeferenced(picture))
+    return fitted(see_whole(picture, told))
+
+
+def see_whole(picture: OwnPicture, told: Told | None = None) -> Sight:
+    """Decode a picture as `see` does, with all of a photo and all its pixels."""
     name = picture.path.name
+    image = _decoded(picture, told or Told(), name)
+    middle_m, side_m = largest_square(image.camera.footprint(Plane()))
+    if side_m < LEAST_M:
+        raise CameraError(
+            f"{name} shows a square of {side_m:.0f} m, a view has at least {LEAST_M:g} m: check the height, or "
+            "leave it out"
+        )
+    return Sight(image=image, middle_m=middle_m, side_m=side_m)
+
+
+def _decoded(picture: OwnPicture, told: Told, name: str) -> AerialImage:
+    if picture.camera is None and picture.position_by == "georeference":
+        rgb, gsd_m = _read_georeferenced(picture)
+        return AerialImage.from_above(rgb, gsd_m=gsd_m)
     rgb = decode_image(read_bounded(picture.path, MOST_BYTES), name=name)
     if picture.camera is None:
         assert told.ground_width_m is not None  # noqa: S101 - by `open_picture`
@@ -370,28 +378,13 @@ def see(picture: OwnPicture, told: Told | None = None) -> Sight:
             raise CameraError(
                 f"{name} would have pixels of {gsd_m:.1f} m by --ground-width, at most 5 show a map's things"
             )
-        return _seen_from_above(rgb, gsd_m, name)
+        return AerialImage.from_above(rgb, gsd_m=gsd_m)
     lens = picture.camera.intrinsics
     if rgb.shape[:2] != (lens.height_px, lens.width_px):
         raise ImageError(
             f"{name} has {rgb.shape[1]} x {rgb.shape[0]} pixels, its head says another size: copy it again"
         )
-    return _seen_by(AerialImage(rgb=rgb, camera=picture.camera), name)
-
-
-def _seen_from_above(rgb: NDArray[np.uint8], gsd_m: float, name: str) -> Sight:
-    return _seen_by(AerialImage.from_above(rgb, gsd_m=gsd_m), name)
-
-
-def _seen_by(image: AerialImage, name: str) -> Sight:
-    footprint = image.camera.footprint(Plane())
-    middle_m, side_m = largest_square(footprint)
-    if side_m < LEAST_M:
-        raise CameraError(
-            f"{name} shows a square of {side_m:.0f} m, a view has at least {LEAST_M:g} m: check the height, or "
-            "leave it out"
-        )
-    return Sight(image=_fitting(image, middle_m, side_m), middle_m=middle_m, side_m=side_m)
+    return AerialImage(rgb=rgb, camera=picture.camera)
 
 
 def largest_square(footprint: shapely.Polygon, *, most_m: float = WIDEST_M) -> tuple[tuple[float, float], float]:
@@ -425,20 +418,21 @@ def largest_square(footprint: shapely.Polygon, *, most_m: float = WIDEST_M) -> t
     return (round(x, 3), round(y, 3)), round(side, 2)
 
 
-def _fitting(image: AerialImage, middle_m: tuple[float, float], side_m: float) -> AerialImage:
-    """Return the part of a picture around a view, with pixels no finer than a segmenter needs."""
-    reach = side_m / 2 * _MARGIN
+def fitted(sight: Sight) -> Sight:
+    """Return what a picture shows with the part of it around the view, and pixels no finer than `FINEST_M`."""
+    image = sight.image
+    reach = sight.side_m / 2 * _MARGIN
     steps = np.linspace(-reach, reach, 9)
-    en_m = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + middle_m
+    en_m = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + sight.middle_m
     points = image.camera.project(np.column_stack([en_m, np.zeros(len(en_m))]))
     points = points[np.isfinite(points).all(axis=1)]
     rows, cols = image.shape
     left, top = np.floor(points.min(axis=0)).clip(0).astype(int).tolist()
     right, bottom = np.minimum(np.ceil(points.max(axis=0)).astype(int), (cols, rows)).tolist()
     part = image.cropped(top, left, bottom - top, right - left)
-    gsd_m = side_m / max(1.0, float(np.ptp(points, axis=0).min()) / _MARGIN)
+    gsd_m = sight.side_m / max(1.0, float(np.ptp(points, axis=0).min()) / _MARGIN)
     factor = int(FINEST_M / gsd_m)
-    return part if factor < 2 else averaged(part, factor)
+    return replace(sight, image=part if factor < 2 else averaged(part, factor))
 
 
 def averaged(image: AerialImage, factor: int) -> AerialImage:
@@ -466,7 +460,7 @@ def resized(lens: Intrinsics, size_px: tuple[int, int], times: tuple[float, floa
     )
 
 
-def _read_georeferenced(picture: OwnPicture) -> tuple[NDArray[np.uint8], float, str]:
+def _read_georeferenced(picture: OwnPicture) -> tuple[NDArray[np.uint8], float]:
     """Read the middle of a georeferenced picture in its own axes: what a view needs; black where it is empty."""
     path = picture.path
     try:
@@ -500,7 +494,7 @@ def _read_georeferenced(picture: OwnPicture) -> tuple[NDArray[np.uint8], float, 
     rgb = np.where(found[3] > 0, found[:3], 0).astype(np.uint8)
     if not (found[3] > 0).any():
         raise ImageError(f"{path} shows nothing around its middle: name a part of it that does")
-    return np.ascontiguousarray(np.moveaxis(rgb, 0, -1)), gsd_m, path.name
+    return np.ascontiguousarray(np.moveaxis(rgb, 0, -1)), gsd_m
 
 
 def names_of(paths: Sequence[Path], root: Path) -> list[str]:

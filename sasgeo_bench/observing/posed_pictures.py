@@ -28,7 +28,6 @@ from sasgeo_bench.observing.pictures import (
     STEEPEST_DEG,
     WIDEST_M,
     OwnPicture,
-    above_origin,
     largest_square,
     list_pictures,
     names_of,
@@ -381,7 +380,7 @@ def _posed(stand: _Stand, heights: Heights, dem: Dem | None) -> PosedPicture | s
             return f"whose camera is not known ({reason_of(error, stand.path)})"
         if camera.tilt_deg > STEEPEST_DEG:
             return f"that look more than {STEEPEST_DEG:g} degrees away from straight down"
-        above = above_origin(camera)
+        above = camera.above_origin()
         middle_m, side_m = largest_square(above.footprint(Plane()))
         if side_m < LEAST_M:
             return f"that show less ground than {LEAST_M:g} m a side"

@@ -467,14 +467,19 @@ def list_region_files(*, folders: Sequence[Path] = ()) -> dict[str, Path]:
 def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     """Find a region file by its id, or return the path of one; raise as `find_document` does.
 
+    Of ids that are in none of the folders, nor in the package, that in `OWN_FOLDER` is taken.
+
     >>> find_region_file("vadus")
     Traceback (most recent call last):
         ...
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
     """
     own = OWN_FOLDER / f"{id_or_path}.toml"
-    mend = f"name the file {own}" if own.is_file() else "list regions shows all"
-    return find_document(id_or_path, "region", mend, lambda: list_region_files(folders=folders))
+
+    def known() -> dict[str, Path]:
+        return ({id_or_path: own} if own.is_file() else {}) | list_region_files(folders=folders)
+
+    return find_document(id_or_path, "region", "list regions shows all", known)
 
 
 def region_text(

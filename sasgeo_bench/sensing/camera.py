@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.core.errors import CameraError
-from sasgeo_bench.geometry.pose import bearing_deg
+from sasgeo_bench.geometry.pose import bearing_deg, rotation
 from sasgeo_bench.sensing.ground import Ground, Plane
 
 Points = NDArray[np.float64]
@@ -375,6 +375,12 @@ class Camera:
         quarter = np.eye(3)
         quarter[:2, :2] = turn
         return self._with(quarter @ self.matrix, self.position_m)
+
+    def above_origin(self) -> Self:
+        """Return the camera above the origin, in axes in which its picture's up is north."""
+        turn = np.eye(3)
+        turn[:2, :2] = rotation(self.yaw_deg)
+        return self._with(self.matrix @ turn, np.array([0.0, 0.0, self.height_m]))
 
     def moved(self, *, east_m: float = 0.0, north_m: float = 0.0, up_m: float = 0.0) -> Self:
         """Return the camera moved by metres; it looks as before."""

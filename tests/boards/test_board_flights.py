@@ -1,23 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board of flights: figures along the way, maps of a flight, its page, and stored results that give it again."""
 
+import html
 import json
+import math
+import re
+import time
 from dataclasses import replace
 
 import cv2
+import numpy as np
 import pandas as pd
 import pytest
 
 from sasgeo_bench.boards.board_files import read_leaderboard, read_scores
 from sasgeo_bench.boards.board_pictures import FLIGHT_BYTES
+from sasgeo_bench.boards.flight_page import ellipse_of, flight_page
 from sasgeo_bench.boards.publish import publish
 from sasgeo_bench.cli.boards import score
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import RunManifest
+from sasgeo_bench.scoring.flights import score_flights
 from sasgeo_bench.tasks import flight_sampling, task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
+from tests.browser import PATIENCE_S, browser, find_chromium
 
 SUITE, REGION = "flight-overconfident", "town-riverside"
 HASH = "0" * 12
@@ -132,19 +140,97 @@ def test_a_run_of_flights_is_listed_and_its_worst_flight_drawn(out, program):
     code, printed, _ = program("inspect", str(out / "runs" / "far"), "--out", str(out))
     assert code == 0
     assert "far: 6 flights, the worst first (--query draws one)" in printed
-    path = printed.rpartition("map of the worst flight: ")[2].strip()
+    path = printed.rpartition("map of the worst flight: ")[2].splitlines()[0]
     assert cv2.imread(path).shape[1] > 300
     flight = read_scores(out / "boards" / "mine")["query_id"].iloc[0]
     code, printed, _ = program("inspect", str(out / "runs" / "far"), "--query", flight[:10], "--out", str(out))
-    assert (code, printed) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")
+    shown = out / "sheets" / f"far-{flight}.png"
+    assert (code, printed) == (0, f"map of the flight: {shown}\npage that plays it: {shown.with_suffix('.html')}\n")
 
 
 def test_a_flight_is_named_by_a_beginning_or_a_view_of_its_own_and_by_nothing_else(out, program):
     run_folder = str(out / "runs" / "far")
     flight = read_scores(out / "boards" / "mine")["query_id"].iloc[0]
     code, printed, _ = program("inspect", run_folder, "--query", f"{flight}000003", "--out", str(out))
-    assert (code, printed) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")
+    shown = out / "sheets" / f"far-{flight}.png"
+    assert (code, printed) == (0, f"map of the flight: {shown}\npage that plays it: {shown.with_suffix('.html')}\n")
     for query, why in (("", "--query is empty"), ("../../", "was asked no query"), ("zz", "was asked no query")):
         code, _, err = program("inspect", run_folder, "--query", query, "--out", str(out))
         assert code == 2
         assert why in err
+
+
+def page_of(out, name="far"):
+    """The page of the first flight of a tracker, with what its script shows, and the truths of its views."""
+    folder = out / "runs" / name / HASH / SUITE / REGION
+    task = task_files.Task.open(out / "tasks" / SUITE / REGION, out)
+    answers = {one.query_id: one for one in prediction_files.read_predictions(folder)}
+    views = score_flights(tuple(task.heads()), task.truths, answers).views
+    flight = views["sequence_id"].iloc[0]
+    text = flight_page(task, flight, "<b>far</b>", views, answers)
+    data = json.loads(text.partition("const flight = ")[2].partition(";\nconst count")[0])
+    return text, data, [truth for truth in task.truths if truth.query_id.startswith(flight)], task
+
+
+def test_the_page_of_a_flight_shows_each_view_where_it_was_and_was_believed(out):
+    text, data, truths, task = page_of(out)
+    assert "<b>far" not in text
+    assert "&lt;b&gt;far&lt;/b&gt; on flight-overconfident over town-riverside" in text
+    assert task.manifest.provenance.credit in html.unescape(text)
+    assert re.search(r"(src|href)=.?https?:|url\(http", text) is None
+    per_m = float(re.search(r"perMetre = ([0-9.e-]+)", text)[1])
+    true = np.array([(truth.pose.easting_m, truth.pose.northing_m) for truth in truths])
+    shown = np.column_stack([data["trueX"], data["trueY"]]) / per_m
+    # right is east and down is south: the way from view to view is the same, to a tenth of a pixel
+    np.testing.assert_allclose(np.diff(shown, axis=0) * (1, -1), np.diff(true, axis=0), atol=0.21 / per_m)
+    off = np.column_stack([data["x"], data["y"]]) / per_m - shown
+    np.testing.assert_allclose(off, np.tile((0, -40), (len(off), 1)), atol=0.21 / per_m)
+    assert set(data["error"]) == {40.0}
+    assert sum(data["accepted"]) in (len(truths) // 2, (len(truths) + 1) // 2)
+    half_px = math.sqrt(25 * 5.991464547) * per_m
+    assert data["ellipse"][0][:2] == pytest.approx([half_px, half_px], abs=0.01)
+    assert len(text) < 1e6
+
+
+def test_the_ellipse_of_a_covariance_is_as_long_and_turned_as_points_drawn_of_it():
+    covariance = np.diag([0.0, 0.0, 1.0])
+    covariance[:2, :2] = [[100.0, 60.0], [60.0, 50.0]]
+    major, minor, turn_deg = ellipse_of(Prediction(query_id="", covariance=tuple(covariance.ravel())), 2.0)
+    points = np.random.default_rng(1).multivariate_normal([0, 0], covariance[:2, :2], 200_000) * (2.0, -2.0)  # pixels
+    turn = np.radians(turn_deg)
+    along, across = points @ [np.cos(turn), np.sin(turn)], points @ [-np.sin(turn), np.cos(turn)]
+    assert abs(np.corrcoef(along, across)[0, 1]) < 0.01
+    assert np.mean((along / major) ** 2 + (across / minor) ** 2 <= 1) == pytest.approx(0.95, abs=0.003)
+    assert major > minor
+    assert ellipse_of(None, 1.0) is None
+    assert ellipse_of(Prediction(query_id=""), 1.0) is None
+    assert ellipse_of(Prediction(query_id="", covariance=(0.0,) * 9), 1.0) is None
+
+
+def test_of_very_many_views_every_second_one_is_shown(out, monkeypatch):
+    _, whole, truths, _ = page_of(out)
+    monkeypatch.setattr("sasgeo_bench.boards.flight_page.MOST_VIEWS", len(truths) - 1)
+    text, data, _, _ = page_of(out)
+    assert f"One of 2 of the {len(truths)} views is shown." in text
+    assert data["frame"] == whole["frame"][::2]
+
+
+@pytest.mark.skipif(find_chromium() is None, reason="no Chromium on this machine (.ci/install-chromium installs one)")
+def test_the_page_plays_in_a_browser_from_a_file_and_asks_nobody(out, tmp_path):
+    text, data, _, _ = page_of(out)
+    path = tmp_path / "flight.html"
+    path.write_text(text, encoding="utf-8")
+    with browser(find_chromium(), tmp_path / "profile") as page:
+        page.width(400)
+        page.open(f"{path.as_uri()}#3")
+        assert page.value("document.getElementById('frame').textContent").startswith("3 of ")
+        assert page.value("document.getElementById('error').textContent") == "40 m"
+        assert page.value("document.getElementById('fix').textContent") in ("accepted, FALSE", "not accepted")
+        assert page.value("document.documentElement.scrollWidth <= 400")
+        page.value("(show(0), document.getElementById('speed').value = '40', document.getElementById('play').click())")
+        last, end = len(data["frame"]) - 1, time.monotonic() + PATIENCE_S
+        while page.value("document.getElementById('at').value") != str(last):
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert [url for url in page.asked if not url.startswith(("file:", "data:"))] == []
+        assert page.faults == []

@@ -101,6 +101,22 @@ def test_evidence_is_drawn_in_the_colours_of_its_classes_with_its_confidence_bes
         sgb.plot_evidence(chance)
 
 
+def test_a_flight_is_drawn_where_it_was_flown_with_its_height_and_speed(tiny):
+    west, south, _, _ = tiny.region.manifest.bounds_m
+    places = np.array([[west + 10, south + 20, 80.0], [west + 40, south + 60, 90.0], [west + 40, south + 160, 90.0]])
+    flown = sgb.Trajectory.of_angles(time_s=[0.0, 10.0, 20.0], position_m=places, yaw_deg=np.zeros(3))
+    chart, height, speed = flown.plot(tiny.region).axes
+    drawn = np.column_stack(chart.lines[1].get_data())
+    np.testing.assert_allclose(np.diff(drawn, axis=0), np.diff(places[:, :2], axis=0))
+    # below it the map: the corner of the panel is that of the region, for the flight begins near it
+    np.testing.assert_allclose(drawn[0], [10, 20], atol=tiny.region.manifest.cell_size_m)
+    assert height.lines[0].get_ydata().tolist() == [80, 90, 90]
+    assert speed.lines[0].get_ydata().tolist() == [5, 10]
+    far = sgb.Trajectory.of_angles(time_s=[0.0, 1.0], position_m=places[:2] + 1e5, yaw_deg=np.zeros(2))
+    with pytest.raises(ConfigError, match="the flight lies beside the map"):
+        far.plot(tiny.region)
+
+
 def test_texts_of_a_region_and_a_query_are_escaped_for_a_notebook(tiny):
     evil = "<script>alert(1)</script>"
     region = replace(tiny.region, manifest=tiny.region.manifest.model_copy(update={"title": evil, "attribution": evil}))

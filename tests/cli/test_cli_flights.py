@@ -2,6 +2,7 @@
 """The commands of flights: what was read, figures of drift, files that are asked for, mistakes on one line."""
 
 import gzip
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ from sasgeo_bench.flights.drift_profile import load_profile, read_drift_profile
 from sasgeo_bench.flights.odometry import dead_reckon, draw_odometry
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum, write_tum
 from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.tasks.task_files import Task
 from tests.flights.autopilots import Flown, fusing, px4_drift, tlog, ulog, write
 
 
@@ -103,7 +105,7 @@ ROWS = "".join(f"{at}000,49.005,{11.001 + at * 6.838e-5:.7f},328.084,90\n" for a
 
 def test_what_is_read_of_a_log_is_printed_with_its_columns_and_units(program, tmp_path) -> None:
     (tmp_path / "log.csv").write_text("time_ms,lat,lon,height_ft,heading_deg\n" + ROWS)
-    code, out, err = program("read-flight", "log.csv")
+    code, out, err = program("import-flight", "log.csv")
     assert (code, err) == (0, "")
     assert out.splitlines() == [
         "6 points, 25 m, 5.0 s, 5.00 m/s on average",
@@ -121,24 +123,24 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
     (tmp_path / "log.csv").write_text("t,lat,lon,height,heading\n" + ROWS)
     words: list[str] = []
     for quantity, unit in (("time", "ms"), ("height", "ft"), ("angle", "none")):
-        assert f"states no unit: say --{quantity}-unit" in mistake("read-flight", "log.csv", *words)
+        assert f"states no unit: say --{quantity}-unit" in mistake("import-flight", "log.csv", *words)
         words += [f"--{quantity}-unit", unit]
-    assert "height from 100.0 to 100.0 m" in program("read-flight", "log.csv", *words)[1]
-    assert "yaw" not in program("read-flight", "log.csv", *words)[1]
-    words[words.index("--height-unit") : words.index("--height-unit") + 2] = ["--height-m", "80"]
-    _, out, err = program("read-flight", "log.csv", *words)
+    assert "height from 100.0 to 100.0 m" in program("import-flight", "log.csv", *words)[1]
+    assert "yaw" not in program("import-flight", "log.csv", *words)[1]
+    words[words.index("--height-unit") : words.index("--height-unit") + 2] = ["--height", "80"]
+    _, out, err = program("import-flight", "log.csv", *words)
     assert err == ""  # its heights are not asked for
     assert out.splitlines()[-3:] == [
         "not read: 'height', 'heading'",
-        "height: 80 m throughout, as --height-m says",
+        "height: 80 m throughout, as --height says",
         "height from 80.0 to 80.0 m",
     ]
     (tmp_path / "line.csv").write_text("lat,lon\n49.005,11.001\n49.005,11.002\n")
-    _, out, err = program("read-flight", "line.csv")
+    _, out, err = program("import-flight", "line.csv")
     assert out.startswith("2 points, 73 m, no times\n")
     assert "no times: a flight has an even speed (--speed-mps, 10 m/s)" in err
-    assert "no height above the ground: a flight needs --height-m" in err
-    _, out, err = program("read-flight", "line.csv", "--height-m", "90", "--speed-mps", "25")
+    assert "no height above the ground: a flight needs --height" in err
+    _, out, err = program("import-flight", "line.csv", "--height", "90", "--speed-mps", "25")
     assert "height: 90 m throughout" in out
     assert err == "no times: a flight has an even speed (--speed-mps, 25 m/s)\n"
 
@@ -146,7 +148,7 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (("log.csv", "--height-m", "nan"), "--height-m must be a number from 5 to 10000, got nan"),
+        (("log.csv", "--height", "nan"), "--height must be a number from 5 to 10000, got nan"),
         (("log.csv", "--speed-mps", "-1"), "--speed-mps must be a number from 0.1 to 100, got -1"),
         (("log.csv", "--speed-mps", "9"), "log.csv has times: leave out --speed-mps"),
         (("log.csv", "--axes", "camera"), "log.csv is no TUM file: leave out --axes"),
@@ -168,17 +170,19 @@ def test_an_option_without_a_meaning_or_beyond_its_range_gets_one_line(mistake, 
     (tmp_path / "log.csv").write_text("time_ms,lat,lon,height_ft,heading_deg\n" + ROWS)
     (tmp_path / "run.txt").write_text("0 0 0 80 0 0 0 1\n1 9 0 80 0 0 0 1\n")
     (tmp_path / "line.kml").write_text("<kml><LineString><coordinates>9,47 9,48</coordinates></LineString></kml>")
-    assert expected in mistake("read-flight", *words)
+    assert expected in mistake("import-flight", *words)
 
 
 def test_gaps_between_flights_are_told_with_their_number(program, tmp_path) -> None:
     rows = "".join(f"{at + 90 * (at > 3)},49.005,{11.001 + at * 6.838e-5:.7f}\n" for at in range(6))
     (tmp_path / "log.csv").write_text("time_s,lat,lon\n" + rows)
-    out = program("read-flight", "log.csv")[1].splitlines()
+    out = program("import-flight", "log.csv")[1].splitlines()
     assert out[1].startswith("2 stretches: a gap of more than 10 s ends one, the longest has 91.0 s")
 
 
-def test_the_stretch_over_a_region_is_written_as_tum(program, mistake, lay_towns, tmp_path) -> None:
+def test_the_queries_of_a_flight_are_drawn_and_its_stretch_over_the_region_is_written_as_tum(
+    program, mistake, lay_towns, tmp_path
+) -> None:
     folder = lay_towns(tmp_path / "out", "town-grid") / "regions" / "town-grid"
     west, south, east, north = read_region(folder).grid.bounds_m
     at = np.linspace(west, east, 201)
@@ -186,13 +190,19 @@ def test_the_stretch_over_a_region_is_written_as_tum(program, mistake, lay_towns
         [np.arange(201.0), at, 0 * at + (south + north) / 2, 0 * at + 80, *[0 * at] * 3, 0 * at + 1]
     )
     np.savetxt(tmp_path / "run.txt", poses)
-    code, out, err = program("read-flight", "run.txt", "--region", folder, "--least-m", "500", "--tum", "cut.txt")
+    words = ("import-flight", "run.txt", "--region", "town-grid")
+    assert "run.txt is named twice" in mistake(*words, "--tum", "run.txt")
+    assert not (tmp_path / "out" / "tasks").exists()
+    code, out, err = program(*words, "--tum", "cut.txt")
     assert code == 0, err
-    assert out.startswith("over town-grid: ")
+    task = Path(out.strip())
+    assert task == Path("out") / "tasks" / "flight-clean" / "town-grid"
+    assert Task.open(tmp_path / task).manifest.is_of_flights
     cut = read_tum(tmp_path / "cut.txt")
     assert cut.position_m[[0, -1], 0] == pytest.approx([west + 100, east - 100], abs=3)
-    assert program("read-flight", "cut.txt")[1] == out.removeprefix("over town-grid: ")
-    assert "run.txt is named twice" in mistake("read-flight", "run.txt", "--region", folder, "--tum", "run.txt")
+    assert f"wrote cut.txt: {program('import-flight', 'cut.txt')[1]}" in err
+    # by the folder of the region, and by the command's old name
+    assert program("read-flight", "run.txt", "--region", folder)[1] == out
 
 
 def test_a_cameras_axes_are_refused_and_read_where_they_are_said(program, mistake, tmp_path) -> None:
@@ -204,11 +214,11 @@ def test_a_cameras_axes_are_refused_and_read_where_they_are_said(program, mistak
         np.savetxt(tmp_path / name, np.column_stack(poses))
     words = ("--truth", "truth.txt", "--estimate", "estimate.txt", "--lengths-m", "100")
     assert "say --axes camera" in mistake("measure-drift", *words)
-    assert "say --axes camera" in mistake("read-flight", "truth.txt")
+    assert "say --axes camera" in mistake("import-flight", "truth.txt")
     _, out, _ = program("measure-drift", *words, "--axes", "camera")
     position = next(line.split() for line in out.splitlines() if line.startswith("position_pct "))
     assert float(position[2]) == pytest.approx(4.7, abs=0.3)
-    assert "301 poses, 300 m over the ground" in program("read-flight", "truth.txt", "--axes", "camera")[1]
+    assert "301 poses, 300 m over the ground" in program("import-flight", "truth.txt", "--axes", "camera")[1]
 
 
 # Logs of autopilots
@@ -217,8 +227,8 @@ def test_a_cameras_axes_are_refused_and_read_where_they_are_said(program, mistak
 def test_what_is_read_of_the_log_of_an_autopilot_is_printed_with_its_messages(program, mistake, tmp_path) -> None:
     pytest.importorskip("pymavlink", reason="needs the extra [logs]")
     write(tmp_path / "log.tlog", tlog(Flown(), systems=(1, 2)))
-    assert "vehicles 1, 2 send places: say which one, as in --vehicle 1" in mistake("read-flight", "log.tlog")
-    code, out, err = program("read-flight", "log.tlog", "--vehicle", "2")
+    assert "vehicles 1, 2 send places: say which one, as in --vehicle 1" in mistake("import-flight", "log.tlog")
+    code, out, err = program("import-flight", "log.tlog", "--vehicle", "2")
     assert (code, err) == (0, "")
     assert out.splitlines() == [
         "200 points, 317 m, 39.8 s, 7.95 m/s on average",

@@ -22,10 +22,13 @@ from sasgeo_bench.flights import log_points
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import read_flight, read_log
 from sasgeo_bench.flights.plans import flight_area
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sensing.camera import Attitude
+from sasgeo_bench.sensing.ground import Dem
+from tests.sensing.test_ground import write_dem
 
 LON, LAT = 9.52, 47.14
 START = dt.datetime(2025, 5, 1, 10, tzinfo=dt.UTC)
@@ -379,7 +382,7 @@ def test_a_log_is_cut_at_a_gap_unless_it_has_no_times(written: Callable, region:
 
 def test_a_log_that_leaves_is_refused_in_one_line_with_the_longest_stretch(written: Callable, region: Region) -> None:
     near = written("b.csv", _table(region, _across(region)[:100]))
-    with pytest.raises(FlightError, match=r"leaves town-grid: of \d+ m .* has 40\d m, 1000 m are .* --margin-m or --l"):
+    with pytest.raises(FlightError, match=r"leaves town-grid: of \d+ m .* has 40\d m, 1000 m are .* a smaller --l"):
         read_flight(near, region, height_m=100.0)
     assert read_flight(near, region, height_m=100.0, least_m=400.0).distance_m[-1] > 400
 
@@ -402,7 +405,7 @@ def test_heights_come_from_the_log_or_are_given(written: Callable, region: Regio
     assert np.unique(read_flight(with_heights, region).position_m[:, 2]).tolist() == [70]
     assert np.unique(read_flight(with_heights, region, height_m=90.0).position_m[:, 2]).tolist() == [90]
     without = written("b.csv", _table(region, _across(region), more=",alt", cells=",470"))
-    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground: say one, as in --height-m 100"):
+    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground: say one, as in --height 100"):
         read_flight(without, region)
 
 
@@ -474,7 +477,7 @@ def test_a_tum_file_in_the_regions_frame_is_cut_alike(tmp_path: Path, region: Re
 )
 def test_wishes_that_cannot_be_are_refused(written: Callable, region: Region, wish: dict) -> None:
     path = written("a.csv", _table(region, _across(region)))
-    with pytest.raises(FlightError, match=next(iter(wish)).replace("_m", "-m")):
+    with pytest.raises(FlightError, match=next(iter(wish)).removesuffix("_m")):
         read_flight(path, region, **({"height_m": 100.0} | wish))
 
 
@@ -492,3 +495,57 @@ def test_a_log_whose_library_is_not_installed_names_the_extra(
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ConfigError, match=rf"needs the package {library}: pip install 'sasgeo-bench\[logs\]'"):
         read_log(written(name, ""))
+
+
+# Heights above the ground by altitudes
+
+
+def above_a_slope(region: Region) -> str:
+    """A GPX of a level flight due east at 600 m above the sea, over ground that rises from 400 m in the west."""
+    west, south, east, north = region.manifest.bounds_m
+    to_lonlat = pyproj.Transformer.from_crs(region.manifest.epsg, 4326, always_xy=True)
+    places = [to_lonlat.transform(x, (south + north) / 2) for x in np.arange(west, east, 10.0)]
+    points = [(lon, lat, second) for second, (lon, lat) in enumerate(places)]
+    return _gpx(points).replace("<time>", "<ele>600</ele><time>")
+
+
+def test_heights_are_altitudes_less_those_of_the_ground_or_of_the_take_off(written, region, tmp_path) -> None:
+    path = written("a.gpx", above_a_slope(region))
+    with pytest.raises(FlightError, match="say one, as in --height 100, or that of the ground by --dem or --takeoff"):
+        read_flight(path, region)
+    flown = read_flight(path, region, facts=LogFacts(takeoff_m=470.0))
+    assert np.ptp(flown.position_m[:, 2]) == 0
+    assert flown.position_m[0, 2] == 130
+    west, south, east, north = region.manifest.bounds_m
+    epsg = region.manifest.epsg
+    grid = Grid.from_bounds(west - 100, south - 100, east + 100, north + 100, cell_size_m=10.0, epsg=epsg)
+    columns = grid.west_m + 10.0 * (np.arange(grid.cols) + 0.5)
+    ground_m = np.broadcast_to(400 + 0.2 * (columns - west), (grid.rows, grid.cols))
+    dem = write_dem(tmp_path / "dem.tif", Dem(grid=grid, cells_m=ground_m.astype(np.float32)), crs=f"EPSG:{epsg}")
+    flown = read_flight(path, region, facts=LogFacts(dem=dem), least_m=500.0)
+    # down to 5 m above the ground, where the stretch ends
+    expected = 600 - (400 + 0.2 * (flown.position_m[:, 0] - west))
+    np.testing.assert_allclose(flown.position_m[:, 2], expected, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "facts", "words"),
+    [
+        ("a.gpx", {"takeoff_m": 470.0, "dem": Path("dem.tif")}, "give --height, --dem or --takeoff-height alone"),
+        ("a.gpx", {"dem": Path("none.tif")}, "none.tif"),
+        ("a.csv", {"takeoff_m": 470.0}, "a.csv has no altitude"),
+        ("a.tum", {"takeoff_m": 470.0}, "a.tum has heights: leave out --dem and --takeoff-height"),
+        ("a.kml", {"takeoff_m": 470.0}, "a.kml has no altitude"),
+    ],
+)
+def test_what_altitudes_do_not_tell_is_refused(written, region, name, facts, words) -> None:
+    west, south, east, north = region.manifest.bounds_lonlat
+    ends = [((south + north) / 2, west), ((south + north) / 2, east)]
+    texts = {
+        "a.gpx": above_a_slope(region),
+        "a.csv": _csv("lat,lon", *(f"{lat},{lon}" for lat, lon in ends)),
+        "a.tum": "0 0 0 80 0 0 0 1\n1 9 0 80 0 0 0 1\n",
+        "a.kml": LINE.format(" ".join(f"{lon},{lat}" for lat, lon in ends)),
+    }
+    with pytest.raises(FlightError, match=words):
+        read_flight(written(name, texts[name]), region, facts=LogFacts(**facts))

@@ -17,7 +17,8 @@ from rasterio.transform import from_origin
 import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, StoreError
 from sasgeo_bench.core.progress import reporting
-from sasgeo_bench.observing.import_photos import ImportRequest, flights_of, import_photos
+from sasgeo_bench.observing.import_photos import ImportRequest, import_photos
+from sasgeo_bench.observing.photo_flights import flights_of
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.pictures import OwnPicture
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights, PosedPicture
@@ -26,6 +27,7 @@ from sasgeo_bench.sensing.crops import drawn_crops
 from sasgeo_bench.tasks.query import TRUTH_SIGMA
 from sasgeo_bench.tasks.task_files import Task
 from tests import pose_files
+from tests.sensing import test_visual_odometry as plane
 from tests.sensing.test_photos import write_photo, xmp_of
 
 TOWN = "town-riverside"
@@ -309,6 +311,63 @@ def test_a_flight_ends_at_a_gap_another_camera_or_a_leap():
     one_second = [posed(str(at), float(at // 2)) for at in range(6)]
     assert [[one.name for one in flight] for flight in flights_of(one_second)] == [["0", "2", "4"]]
     assert flights_of([replace(one, time_s=None) for one in gap]) == []
+
+
+@pytest.fixture
+def flown(region, middle, laid, tmp_path):
+    """Lay photos of a textured plane, 15 m from each to the next, northward; the fourth shows nothing."""
+
+    def lay(shifts, **options):
+        folder = tmp_path / "photos"
+        folder.mkdir(exist_ok=True)
+        rows = []
+        for at, (east, north) in enumerate(shifts):
+            rgb = plane.picture((0.0, 15.0 * at - 40.0, 60.0, 0.0, 0.0, 0.0))
+            Image.fromarray(rgb if at != 3 else np.full_like(rgb, 90)).save(folder / f"{at}.png")
+            place = offset(middle, east, 15.0 * at - 40.0 + north)
+            angles = (-north_of_grid(region, *place), -90.0, 0.0)
+            film = plane.FOCAL_PX * math.hypot(36.0, 24.0) / math.hypot(plane.SIDE_PX, plane.SIDE_PX)
+            size = (plane.SIDE_PX, plane.SIDE_PX)
+            more = {"height": 60.0, "angles": angles, "time": clock(2 * at), "film": film, "size": size}
+            rows.append(row(region, f"{at}.png", place, **more))
+        return laid(rows, without={line.split(",")[0] for line in rows}, **options)
+
+    return lay
+
+
+def test_visual_odometry_is_what_the_pictures_show(flown, program):
+    request = flown(np.zeros((6, 2)))
+    words = ("--region", str(request.region), "--poses", str(request.poses), "--out", str(request.out))
+    code, out, err = program("import-photos", str(request.pictures), *words, "--odometry", "visual")
+    assert code == 0, err
+    tasks = [Task.open(Path(line)) for line in out.splitlines()]
+    steps = [query.step for query in sorted(tasks[1].queries(), key=lambda query: query.step.frame)]
+    assert [step.increment is None for step in steps] == [True, False, False, True, True, False]
+    for step in steps:
+        if step.increment is not None:
+            np.testing.assert_allclose(step.increment, (0.0, 15.0, 0.0), atol=0.3)
+            spread_m = math.sqrt(step.covariance[4])
+            assert 0.1 * 15.0 < spread_m < 0.3 * 15.0  # heights above take-off are known to 10 %
+    assert "visual: matches of ORB features" in tasks[1].manifest.what
+    assert "odometer" not in tasks[0].manifest.what
+    (line,) = [line for line in err.splitlines() if line.startswith("visual odometry")]
+    assert line.startswith("visual odometry: 2 of 5 pairs of pictures lost (40%); off the files' positions by 0.")
+
+
+def test_visual_odometry_does_not_know_the_positions(flown):
+    plain, moved = (
+        [(query.step, query.prior.center_m) for query in quiet(flown(shifts, odometry="visual"))[0][1].queries()]
+        for shifts in (np.zeros((6, 2)), np.random.default_rng(5).uniform(-9, 9, (6, 2)))
+    )
+    assert [step for step, _ in plain] == [step for step, _ in moved]
+    assert [center_m for _, center_m in plain] != [center_m for _, center_m in moved]
+
+
+def test_drawn_odometry_looks_at_no_picture(flown):
+    tasks, lines = quiet(flown(np.zeros((6, 2))))
+    assert all(query.step.increment is not None for query in tasks[1].queries() if query.step.frame)
+    assert "drifts as vio-mono was measured to" in tasks[1].manifest.what
+    assert not any(line.startswith("visual odometry") for line in lines)
 
 
 def test_pictures_without_a_pose_are_left_out_and_counted(region, middle, laid):

@@ -90,13 +90,17 @@ def test_the_newest_extract_is_picked_and_any_by_its_date():
         region.pick(dt.date(2021, 1, 1))
 
 
-def test_a_region_that_new_region_wrote_is_named_by_its_file(tmp_path, monkeypatch):
+def test_a_region_that_new_region_wrote_is_found_by_its_name_after_those_of_the_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r"there is no region 'my-town' \(list regions shows all\)"):
         find_region_file("my-town")
     own = OWN_FOLDER / "my-town.toml"
     own.parent.mkdir()
     own.write_text(text().replace('"mine"', '"my-town"'), encoding="utf-8")
-    with pytest.raises(ConfigError, match=rf"there is no region 'my-town' \(name the file {own}\)"):
-        find_region_file("my-town")
-    assert find_region_file("my-town", folders=[own.parent]) == own
+    assert find_region_file("my-town") == own
+    other = tmp_path / "others" / "my-town.toml"
+    other.parent.mkdir()
+    other.write_text(own.read_text(encoding="utf-8"), encoding="utf-8")
+    assert find_region_file("my-town", folders=[other.parent]) == other
+    (OWN_FOLDER / "vaduz.toml").write_text(text().replace('"mine"', '"vaduz"'), encoding="utf-8")
+    assert find_region_file("vaduz") != OWN_FOLDER / "vaduz.toml"

@@ -178,7 +178,10 @@ def _chosen(flights: Mapping[str, Sequence[tuple[Head, Truth]]], flight: str | N
     found = [name for name in flights if name.startswith(flight or "")]
     if len(found) == 1:
         return found[0]
-    listed = [f"{name} ({counted(len(flights[name]), 'view')})" for name in (found or flights)]
+    # Several flights follow one log: with odometers of several kinds, and as their control.
+    listed = [
+        f"{name} ({flights[name][0][1].kind}, {counted(len(flights[name]), 'view')})" for name in found or flights
+    ]
     shown = ", ".join(listed[:_NAMED]) + (", ..." if len(listed) > _NAMED else "")
     if flight is None:
         raise ConfigError(f"{run} answers {len(flights)} flights, name one by --flight: {shown}")

@@ -17,7 +17,7 @@ SOURCES := sasgeo_bench baselines paper benchmarks tests docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo head-start list-regions build-region queries leaderboard test test-of test-quick test-torch test-oldest test-wheel check bench ageing figures docs lock clean
+.PHONY: help install demo head-start list-regions build-region queries leaderboard test test-of test-quick test-torch test-oldest test-wheel check bench ageing figures docs lock wheels-arm clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
@@ -162,6 +162,14 @@ lock: ## resolve requirements.lock and requirements-docs.lock anew from pyprojec
 	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
 	  --output-file requirements-docs.lock $(ARGS)
 
+# Nothing is installed. jsonpath-rw, of the extra [publish], has a wheel on no system: it is Python alone.
+wheels-arm: ## check that every package of requirements.lock has a wheel for Linux on aarch64, glibc 2.28 (needs uv)
+	for version in 3.11 3.12 3.13; do \
+	  $(UV) pip install --quiet --dry-run --no-config --require-hashes --only-binary :all: --no-binary jsonpath-rw \
+	    --python-platform aarch64-manylinux_2_28 --python-version $$version --target .venv-arm -r requirements.lock || exit 1; \
+	done
+	rm -r .venv-arm
+
 clean: ## remove .venv and caches; keeps what was built in $(OUT)
-	rm -rf $(VENV) .venv-oldest .venv-wheel .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
+	rm -rf $(VENV) .venv-oldest .venv-wheel .venv-arm .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +

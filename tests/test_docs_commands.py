@@ -61,6 +61,7 @@ ONLY_PARSED = {
     r"^sasgeo-bench import-flight ": "needs a log of the reader's own; tests/cli/test_cli_flights.py reads some",
     r"runs/sasgeo_track|my-flight": "needs a flight of the reader's own; tests/running/test_trackers.py flies some",
     r"--train ": "needs a matcher that learns; tests/running does it",
+    r"--maps ": "needs a task on that map; tests/running/test_packed_runs.py asks some",
     r"FILE\.json|<hash>": "needs what a matcher has learnt",
     r"HASH|--query ID": "needs a run or a query of the reader's own; tests/boards/test_board_pictures.py does it",
     r"out/boards/demo": "needs the board of the demo; tests/boards/test_publish.py publishes small ones",
@@ -70,7 +71,7 @@ ONLY_PARSED = {
     r"^sasgeo-bench locate ": "needs pictures of the reader's own; tests/observing/test_locate.py draws some",
     r"^sasgeo-bench import-photos |tasks/photos": "needs photos; tests/observing/test_import_photos.py makes some",
     r"^sasgeo-bench import-masks |tasks/masks": "needs masks; tests/observing/test_import_masks.py makes some",
-    r"^sasgeo-bench (import|locate)-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
+    r"^sasgeo-bench import-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
     r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",
 }
 # Commands of other programs that are not run, each with its reason.

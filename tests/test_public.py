@@ -55,7 +55,6 @@ def test_baselines_and_a_new_plugin_need_public_names_alone():
 
 
 STEPS = {
-    "propose-regions": "propose_regions",
     "build-region": "build_region",
     "render-imagery": "render_imagery",
     "make-queries": "make_tasks",

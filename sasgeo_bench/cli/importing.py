@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands about datasets of other benchmarks: import one, score a ranking of it, find the map under it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -9,28 +10,35 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out, RegionFolders
-from sasgeo_bench.core.errors import counted, named
+from sasgeo_bench.core.errors import ConfigError, counted, named
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.exchange.importers.items import Dataset, Role
 from sasgeo_bench.exchange.importers.kinds import IMPORTERS, read_dataset
 from sasgeo_bench.exchange.importers.reports import Report
 
 MOST: Final = 3  # regional extracts that are named for an area: its box may lie in those of neighbours
-Folder = Annotated[Path, typer.Argument(help="folder of the dataset; it is only read")]
-Kind = Annotated[str, typer.Option(help=f"kind of the dataset: {', '.join(IMPORTERS)}")]
 
 
 def import_dataset_command(
-    folder: Folder,
+    folder: Annotated[Path, typer.Argument(help="folder of the dataset; it is only read")],
     *,
-    kind: Kind,
+    kind: Annotated[str, typer.Option(help=f"kind of the dataset: {', '.join(IMPORTERS)}")],
     ranking: Annotated[
         list[Path] | None,
         typer.Option(help="Parquet file of query_id, gallery_id, rank (from 1) to score; may be repeated"),
     ] = None,
+    where: Annotated[
+        bool, typer.Option("--where", help="say where it lies, and which extracts cover it; write nothing")
+    ] = False,
+    regions: RegionFolders = None,
     out: Out = Path("out"),
 ) -> None:
     """List queries and gallery of another benchmark's dataset, and score a ranking of them: OUT/datasets/KIND."""
+    if where:
+        if ranking:
+            raise ConfigError("--where scores nothing: leave it out, or leave out --ranking")
+        _say_where(folder, kind, regions or ())
+        return
     from sasgeo_bench.core.folders import sha256_of  # noqa: PLC0415
     from sasgeo_bench.exchange.importers.reports import score_ranking  # noqa: PLC0415
     from sasgeo_bench.exchange.importers.retrieval import read_ranking  # noqa: PLC0415
@@ -46,11 +54,11 @@ def import_dataset_command(
         _show(report)
 
 
-def locate_dataset_command(folder: Folder, *, kind: Kind, regions: RegionFolders = None) -> None:
+def _say_where(folder: Path, kind: str, regions: Sequence[Path]) -> None:
     """Say where a dataset lies, and which OpenStreetMap extracts cover it."""
     from sasgeo_bench.exchange.importers.reader import find_extents  # noqa: PLC0415
 
-    extents = find_extents(_read(folder, kind), folders=regions or ())
+    extents = find_extents(_read(folder, kind), folders=regions)
     table = Table("area", "items", "center_lonlat", "km", "west,south,east,north", box=None, pad_edge=False)
     for title in ("regions that cover it", "regions in part", "regional extracts"):
         table.add_column(title)

@@ -25,6 +25,7 @@ from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import read_overview
+from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_manifest
@@ -70,7 +71,10 @@ class InspectOptions(Options):
 def inspect_command(
     target: Annotated[
         str,
-        typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one, a run or a board"),
+        typer.Argument(
+            help="a built region, a packed map (*.map), a task (SUITE/REGION), a split, or the folder of one, a run or "
+            "a board"
+        ),
     ],
     options: InspectOptions,
 ) -> None:
@@ -100,6 +104,8 @@ def inspect_command(
         _inspect_split(target, out, folders)
         return
     manifest = read_manifest(region_folder)
+    if is_packed_map(Path(target)):
+        say(f"{target}: {unpack_map(target, out).about.to_text()}")
     print_table(_summary(manifest, region_folder, _preview(manifest, region_folder, out)))
     print_table(_class_table(manifest))
     if (reasons := _reasons(manifest)).row_count:

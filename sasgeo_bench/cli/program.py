@@ -35,10 +35,10 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     },
     "Regions": {
         "new-region": "regions",
-        "propose-regions": "regions",
         "build-region": "regions",
         "render-imagery": "regions",
         "measure-ageing": "ageing",
+        "pack-map": "regions",
     },
     "Your own pictures": {
         "locate": "observing",
@@ -78,11 +78,11 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Flights": {
         "import-flight": "flights",
         "measure-drift": "flights",
+        "check-gnss": "flights",
         "replay": "replaying",
     },
     "Datasets of others": {
         "import-dataset": "importing",
-        "locate-dataset": "importing",
     },
 }
 
@@ -97,12 +97,13 @@ ALIASES: Final = {
     "validate": ("verify",),
     "read-flight": ("import-flight",),
     "compare-ageing": ("measure-ageing", "--compare"),
+    "propose-regions": ("new-region", "--manifest"),
+    "locate-dataset": ("import-dataset", "--where"),
 }
 
 # Command -> what is kept of it when it is interrupted, and how to go on; the others write all or nothing.
 KEPT: Final = {
-    "new-region": "what was downloaded is kept; the same command goes on from there",
-    "propose-regions": "files that were written are kept; the same command writes the others",
+    "new-region": "what was downloaded and written is kept; the same command goes on from there",
     "build-region": "regions that were built are kept; the same command builds the others",
     "render-imagery": "images that were rendered are kept; the same command renders the others",
     "make-queries": "tasks that were drawn are kept; the same command draws them again, with the same queries",

@@ -13,13 +13,15 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from sasgeo_bench.cli.built_regions import built_region
 from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.core.errors import ConfigError, ImageError, SasgeoError, counted, named
-from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.folders import absolute, fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import reported, spread, tell
 from sasgeo_bench.regions import build
+from sasgeo_bench.regions.packed_map import SUFFIX, UNPACKED, Weights, pack_map
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_spec import (
     OWN_FOLDER,
@@ -161,7 +163,9 @@ PHOTOS: Final = (".jpg", ".jpeg", ".tif", ".tiff", ".dng")
 class NewRegionOptions(Options):
     """Flags of new-region."""
 
-    name: Annotated[str, typer.Argument(help="id of the region, such as my-town")] = field(kw_only=False)
+    name: Annotated[str | None, typer.Argument(help="id of the region, such as my-town")] = field(
+        default=None, kw_only=False
+    )
     center: Annotated[str | None, typer.Option(help="LON,LAT of its middle, degrees; with --size")] = None
     size: Annotated[str | None, typer.Option(help="of its sides, such as 2km, 800m or 2x3km (width x height)")] = None
     bounds: Annotated[str | None, typer.Option(help="W,S,E,N, degrees; instead of --center")] = None
@@ -216,6 +220,8 @@ def new_region(options: NewRegionOptions) -> Path:
     """  # noqa: E501 - an error is one line
     from sasgeo_bench.regions import new_region as one_region  # noqa: PLC0415 - build-region needs none
 
+    if options.name is None:
+        raise ConfigError("name the region, such as my-town: it becomes its id, and the name of its file")
     folders = options.extracts or []
     path = one_region.new_region(
         options.name,
@@ -285,15 +291,32 @@ def _taken_at(folder: Path) -> NDArray[np.float64]:
     return np.array(lonlat, dtype=np.float64).reshape(-1, 2)
 
 
-def new_region_command(options: NewRegionOptions) -> None:
-    """Write the region file of a place: INTO/NAME.toml, from the newest extract at hand that covers it."""
+def new_region_command(
+    options: NewRegionOptions,
+    *,
+    manifest: Annotated[
+        Path | None, typer.Option(help="list of extracts (*.toml): a file for each of one to three windows of each")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="with --manifest, places read at once")] = 1,
+) -> None:
+    """Write the region file of a place: INTO/NAME.toml, from the newest extract at hand that covers it; or of many."""
+    given = vars(options) | {"say": say}
     with shown_progress():
-        new_region(**vars(options) | {"say": say})
+        if manifest is None:
+            new_region(**given)
+            return
+        shared = {name: given.pop(name) for name in ("into", "extracts", "say", "tell", "progress")}
+        other = [name for name, value in vars(NewRegionOptions()).items() if name in given and given[name] != value]
+        if other:
+            raise ConfigError(
+                f"--manifest states the places itself: leave {other[0].replace('_', '-')} out, or leave out --manifest"
+            )
+        propose_regions(manifest, jobs=jobs, **shared)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProposeOptions(Options):
-    """Flags of propose-regions."""
+    """Keywords of propose_regions, as flags of new-region --manifest."""
 
     manifest: Annotated[Path, typer.Argument(help="list of extracts (*.toml): file, place, country, what, date")] = (
         field(kw_only=False)
@@ -365,10 +388,41 @@ def _holds(path: Path, text: str) -> bool:
         return False
 
 
-def propose_regions_command(options: ProposeOptions) -> None:
-    """Write region files for the extracts of a manifest: one to three windows for each place, where it is built."""
-    with shown_progress():
-        propose_regions(**vars(options) | {"say": say})
+def pack_map_command(
+    region: Annotated[str, typer.Argument(help="built region, or its folder")],
+    *,
+    with_imagery: Annotated[
+        bool, typer.Option("--with-imagery", help="pack the aerial imagery, too: it is far larger than the map")
+    ] = False,
+    learned: Annotated[
+        Path | None,
+        typer.Option(help="folder of a run, OUT/runs/MATCHER/HASH/SUITE/REGION: pack what it has learned, too"),
+    ] = None,
+    into: Annotated[Path | None, typer.Option(help="file to write, *.map; default: OUT/maps/REGION.map")] = None,
+    out: Out = Path("out"),
+) -> None:
+    """Write what matching reads of a built region into one file, for a computer that builds no regions."""
+    folder = built_region(region, out)
+    path = into or out / UNPACKED / f"{absolute(folder).name}{SUFFIX}"
+    weights = None if learned is None else _learned_by(learned)
+    about = pack_map(folder, path, with_imagery=with_imagery, learned=weights)
+    say(f"{path}: {about.to_text()}")
+
+
+def _learned_by(run: Path) -> tuple[Weights, Path]:
+    """Return who learned what in a run, and the file of that text."""
+    from sasgeo_bench.matching.cards import read_learned  # noqa: PLC0415 - build-region needs none
+    from sasgeo_bench.running.prediction_files import RunManifest  # noqa: PLC0415 - as above
+
+    about = RunManifest.open(run)
+    training = None if about is None else about.learned
+    if about is None or training is None or training.file is None:
+        what = "holds no run" if about is None else "is a run without training"
+        raise ConfigError(f"{run} {what}: name one that was made with --train, as OUT/runs/MATCHER/HASH/SUITE/REGION")
+    path = absolute(run).parent.parent / training.file
+    if read_learned(path) is None:
+        raise ConfigError(f"{path} is missing, which {run} says was learned: run again with the same --train")
+    return Weights(matcher=about.matcher.name, trained_on=tuple(training.trained_on), pairs=training.pairs), path
 
 
 @dataclass(frozen=True, kw_only=True)

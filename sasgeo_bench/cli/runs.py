@@ -15,6 +15,7 @@ from sasgeo_bench.cli.options import Dask, Options, Out, RegionFolders, takes
 from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.matching.matcher import SOUND
+from sasgeo_bench.regions.packed_map import unpack_map
 from sasgeo_bench.running import runner
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.prediction_files import merge_runs
@@ -24,6 +25,10 @@ from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks.split import Split, find_split, list_split_files
 from sasgeo_bench.tasks.task_files import Task
 
+PackedMaps = Annotated[
+    list[Path] | None,
+    typer.Option(help="packed map (*.map), in place of the built region of its tasks; may be repeated"),
+]
 SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 
 
@@ -33,6 +38,7 @@ class RunOptions(Options):
 
     matcher: Annotated[str, typer.Option(help="name from list matchers or list trackers, or module:Class")]
     tasks: Annotated[list[Path], typer.Option(help="task folders, as OUT/tasks/SUITE/*")]
+    maps: PackedMaps = None
     top_k: Annotated[int, typer.Option(help="poses asked of each query")] = 25
     jobs: Annotated[int, typer.Option(help="processes at once")] = 1
     dask: Dask = None
@@ -115,6 +121,7 @@ def run(options: RunOptions) -> RunReport:
             train=tuple(options.train or ()),
             most_trained=options.most_trained,
             split=_split(options.split, options.tasks, options.region_files) if options.train else None,
+            maps=[unpack_map(path, options.out) for path in options.maps or ()],
         )
     )
     if options.dry_run:
@@ -179,6 +186,7 @@ class ProfileOptions(Options):
         list[Path],
         typer.Option(help="task folders, OUT/tasks/SUITE/REGION, of one map"),
     ]
+    maps: PackedMaps = None
     cores: Annotated[int, typer.Option(help="processors that the matcher and this program share")] = 1
     memory_mb: Annotated[int, typer.Option(help="MB (10^6 bytes) for all processes of the matcher")] = 2000
     seconds: Annotated[
@@ -207,6 +215,7 @@ def profile_command(options: ProfileOptions) -> None:
         radius_m=options.radius,
         train=tuple(options.train or ()),
         is_sandboxed=not options.trusted,
+        maps=[unpack_map(path, options.out) for path in options.maps or ()],
     )
     plan = plan_profile(request)
     folder = options.into or options.out / "profiles" / plan.card.name

@@ -16,6 +16,7 @@ from sasgeo_bench.cli.targets import find_task, is_split, no_target
 from sasgeo_bench.core.errors import ConfigError, counted, named
 from sasgeo_bench.core.progress import spread, tell
 from sasgeo_bench.exchange.submissions import hold_submission
+from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 from sasgeo_bench.regions.region_files import differing_files, read_features
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running.prediction_files import Violation, parts_of
@@ -33,8 +34,8 @@ def verify_command(
     target: Annotated[
         str | None,
         typer.Argument(
-            help="a built region, a task (SUITE/REGION), a split, a run, a submission, the folder of one, or a file of "
-            "predictions"
+            help="a built region, a packed map (*.map), a task (SUITE/REGION), a split, a run, a submission, the "
+            "folder of one, or a file of predictions"
         ),
     ] = None,
     tasks: Annotated[
@@ -60,7 +61,7 @@ def verify_command(
         with_truths = "every query has its truth" if task.has_truths else "its truths are not here"
         faults, good = check_task(task), f"all files are as task.json says, and {with_truths}"
     elif region_folder is not None:
-        faults, good = differing_files(region_folder), "all files are as the manifest says"
+        faults, good = differing_files(region_folder), f"all files are as the manifest says{_size(target, out)}"
     elif is_split(target):
         faults, good = _shared_ground(target, out, region_folders or [])
     elif (tasks or target.endswith(PARQUET) or is_run(Path(target))) and parts_of(Path(target)):
@@ -73,6 +74,11 @@ def verify_command(
     if faults:
         raise typer.Exit(EXIT_USER)
     say(f"{target}: {good}")
+
+
+def _size(target: str, out: Path) -> str:
+    """Return what a packed map adds to the line of its region: its size, and what was left out."""
+    return f"; {unpack_map(target, out).about.to_text()}" if is_packed_map(Path(target)) else ""
 
 
 def _verify_answers(predictions: Path, tasks: list[Path]) -> None:

@@ -11,12 +11,12 @@ import io
 import lzma
 import re
 import tarfile
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Final
 
 from sasgeo_bench.boards.pipeline_spec import ArchiveSpec
+from sasgeo_bench.core.archives import plain_members
 from sasgeo_bench.core.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.core.folders import locked, remove_tree
 from sasgeo_bench.core.json import parse_json
@@ -120,7 +120,9 @@ def _unpack(archive: Path, data: bytes, scratch: Path) -> None:
     """Unpack an archive of answers alone; whatever else is in it is refused before the first is written."""
     try:
         with tarfile.open(fileobj=io.BytesIO(_unpressed(data)), mode="r:") as packed:
-            files = {name: packed.extractfile(member) for name, member in _files(archive, packed)}
+            mend = f"pack answers alone, the folder {FOLDER} as it lies below OUT"
+            members = plain_members(archive, packed, is_known=_is_of_run, most=MOST_FILES, mend=mend)
+            files = {name: packed.extractfile(member) for name, member in members}
             for name, file in files.items():
                 path = scratch / name
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -145,30 +147,10 @@ def _unpressed(data: bytes) -> bytes:
     return bytes(found)
 
 
-def _files(archive: Path, packed: tarfile.TarFile) -> Iterator[tuple[str, tarfile.TarInfo]]:
-    """Yield the files of an archive with their paths; raise `StoreError` for one that is none of a run, or too many."""
-    seen: set[str] = set()
-    for count, member in enumerate(packed, start=1):
-        path = PurePosixPath(member.name)
-        is_plain = member.type in {tarfile.REGTYPE, tarfile.AREGTYPE} and member.sparse is None
-        fault = None
-        if count > MOST_FILES:
-            fault = f"more than {MOST_FILES} files and folders"
-        elif not (is_plain or member.isdir()) or str(path) in seen:
-            fault = f"{one_line(member.name)[:80]!r}, which is no plain file, or is there twice"
-        elif not _is_of_run(path, is_file=is_plain):
-            fault = f"{one_line(member.name)[:80]!r}"
-        if fault is not None:
-            raise StoreError(f"{archive} holds {fault}: pack answers alone, the folder {FOLDER} as it lies below OUT")
-        if is_plain:
-            seen.add(str(path))
-            yield str(path), member
-
-
-def _is_of_run(path: PurePosixPath, *, is_file: bool) -> bool:
+def _is_of_run(path: PurePosixPath, is_file: bool) -> bool:  # noqa: FBT001 - as `plain_members` asks
     """Return whether a member is the record of a run or a part of its answers, or a folder on the way there.
 
-    >>> [_is_of_run(PurePosixPath(name), is_file=True) for name in ("runs/a/b/clean/vaduz/run.json", "runs/../a")]
+    >>> [_is_of_run(PurePosixPath(name), True) for name in ("runs/a/b/clean/vaduz/run.json", "runs/../a")]
     [True, False]
     """
     parts = path.parts

@@ -22,6 +22,7 @@ from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
 from sasgeo_bench.flights.log_dataflash import read_dataflash
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
+from sasgeo_bench.flights.log_subtitles import read_srt
 from sasgeo_bench.flights.log_table import read_csv
 from sasgeo_bench.flights.log_telemetry import read_tlog
 from sasgeo_bench.flights.log_ulog import read_ulog
@@ -43,6 +44,7 @@ _READERS: Final = MappingProxyType(
         ".gpx": read_gpx,
         ".kml": read_kml,
         ".kmz": read_kml,
+        ".srt": lambda path: read_srt(path).log,
         ".ulg": read_ulog,
         ".bin": read_dataflash,
         ".log": read_dataflash,
@@ -59,7 +61,7 @@ _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
 def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | None = None) -> FlightLog:
-    """Read a log by its suffix (GPX, KML, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
+    """Read a log by its suffix (GPX, KML, SRT, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
 
     `facts` say what a table does not; what they say of a file without it is refused. A line drawn in KML has no times:
     `read_flight` flies it at an even speed. A `height_m` replaces the log's heights.
@@ -148,8 +150,8 @@ def read_flight(
     Parameters
     ----------
     path : Path
-        GPX, KML, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting, northing and height
-        of the region's CRS.
+        GPX, KML, SRT of a DJI, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting,
+        northing and height of the region's CRS.
     region : Region
         The stretch lies over its mapped ground.
     margin_m : float

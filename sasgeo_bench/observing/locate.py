@@ -34,6 +34,7 @@ from sasgeo_bench.observing.pictures import (
     see,
 )
 from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.regions.packed_map import UNPACKED
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.plan import hidden_below, matcher_code, segmenter_code
@@ -182,7 +183,9 @@ class _Asker:
         self._request, self._region, self._manifest = request, region, manifest
         hidden = hidden_below([request.out.resolve()])
         reach = Reach(
-            readable=(), hidden=[*hidden, request.out.resolve() / "regions"], is_sandboxed=request.is_sandboxed
+            readable=(),
+            hidden=[*hidden, *(request.out.resolve() / name for name in ("regions", UNPACKED))],
+            is_sandboxed=request.is_sandboxed,
         )
         self._segmenter = SegmenterProcess(spec=request.segmenter, reach=reach, limits=request.limits)
         reach = Reach(readable=[region.resolve()], hidden=hidden, is_sandboxed=request.is_sandboxed)

@@ -3,7 +3,7 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from pathlib import Path
@@ -284,10 +284,11 @@ def read_features(folder: Path) -> "gpd.GeoDataFrame":
     return check_features(_read_geometry(folder / FEATURES))
 
 
-def check_files(folder: Path) -> None:
-    """Raise `StoreError` naming the first file of a region that is missing or differs from `region.json`."""
+def check_files(folder: Path, names: Collection[str] | None = None) -> None:
+    """Raise `StoreError` naming the first file of a region, or of `names`, that differs from `region.json`."""
     for name, record in read_manifest(folder).files.items():
-        _check_file(folder / name, record)
+        if names is None or name in names:
+            _check_file(folder / name, record)
 
 
 def _check_file(path: Path, record: FileRecord) -> None:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
-from sasgeo_bench.core.errors import ConfigError, StoreError, counted
+from sasgeo_bench.core.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.core.plugins import (
     MATCHERS,
     ORACLE,
@@ -25,6 +25,7 @@ from sasgeo_bench.matching.cards import TrainingRecord, learned_path, read_learn
 from sasgeo_bench.matching.follower import follower_record
 from sasgeo_bench.matching.matcher import SOUND, STATUSES, MatcherCard, matcher_hash
 from sasgeo_bench.regions.imagery import ORTHO
+from sasgeo_bench.regions.packed_map import UNPACKED, UnpackedMap
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import CARD
@@ -70,8 +71,9 @@ _BYTES_PER_MB = 10**6
 # Folders below a root that reveal truths, answers, or what pictures of later queries show.
 _HIDDEN: Final = (
     *("tasks", "truth", "runs", "boards", "release", "results", "sheets", "sealed"),
-    *("segmenters", "private", "datasets", "head-start"),
+    *("segmenters", "private", "datasets", "head-start", "frames"),
 )
+MAPS: Final = ("regions/*", f"{UNPACKED}/*/*")  # below a root: built, and unpacked
 _LEAST_MB, _MOST_MB = 64, 4_000_000
 
 
@@ -91,7 +93,7 @@ class RunRequest:
     places and how far apart training and test places must lie. An oracle (`is_oracle`) may train on what it is asked,
     and is never ranked. `hidden` are files that the matcher must not see besides truths and the like, such as that of a
     private seed. `only` are the hashes of the queries to ask, by id: others, and flights with one of these, are left
-    out; all are asked without it.
+    out; all are asked without it. `maps` are packed ones, unpacked: a task on one of these needs no built region.
     """
 
     spec: str
@@ -113,6 +115,7 @@ class RunRequest:
     is_oracle: bool = False
     hidden: Sequence[Path] = ()
     only: Mapping[str, str] | None = None
+    maps: Sequence[UnpackedMap] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,11 +142,30 @@ class RunPart:
     key: str | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PackedTraining:
+    """What a matcher learned elsewhere, packed with a map, in place of a training set; `count` are its pairs."""
+
+    text: str
+    places: tuple[str, ...]
+    count: int
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    def to_text(self) -> str:
+        """As that of a training set."""
+        return f"{counted(self.count, 'query', 'queries')} of {named(self.places, 'place')}, packed with the map"
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunPlan:
     """Plan of a run, made after the plugin's card was read in its own process.
 
-    `training_result` is the reply to training, without a text where it failed, and None before.
+    `training_result` is the reply to training, without a text where it failed, and None before. Where the matcher has
+    learned elsewhere, `training_set` is what was packed with a map.
     """
 
     request: RunRequest
@@ -151,7 +173,7 @@ class RunPlan:
     hash: str
     parts: tuple[RunPart, ...]
     learns: bool = False
-    training_set: TrainingSet | None = None
+    training_set: TrainingSet | PackedTraining | None = None
     training_result: Reply | None = None
 
     @property
@@ -223,10 +245,12 @@ def plan_run(request: RunRequest) -> RunPlan:
     _check(request)
     if request.dask is not None:  # other processes work in other folders
         asked, train = ([task.resolve() for task in folders] for folders in (request.tasks, request.train))
-        request = replace(request, out=request.out.resolve(), tasks=asked, train=train)
+        maps = [replace(one, root=one.root.resolve()) for one in request.maps]
+        request = replace(request, out=request.out.resolve(), tasks=asked, train=train, maps=maps)
     if ":" not in request.spec:
         list_entry_points()  # warns of a clash of names: what the plugin's own process prints is not shown
     tasks = [Task.open(folder) for folder in dict.fromkeys(request.tasks)]
+    _check_maps(request.maps, tasks)
     card, code, learns = _card(request)
     _check_seen(tasks, card)
     limits = _hashed(request.limits, learns=learns)
@@ -234,8 +258,12 @@ def plan_run(request: RunRequest) -> RunPlan:
         {"top_k": request.top_k, "limits": limits, "is_sandboxed": request.is_sandboxed}, sort_keys=True
     )
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
-    training_set = result = None
-    if learns and request.train:
+    training_set: TrainingSet | PackedTraining | None = None
+    result = None
+    if learns and not request.train:
+        training_set = _packed_training(request.maps, card)
+        result = None if training_set is None else Reply(status="ok", learned=training_set.text)
+    elif learns:
         training_set = plan_training(
             request.train,
             asked=() if request.is_oracle else request.tasks,
@@ -286,7 +314,23 @@ def _run_folder(request: RunRequest, card: MatcherCard, found: str) -> Path:
     return request.out / "runs" / card.name / found
 
 
-def _key(training_set: TrainingSet, result: Reply | None) -> str:
+def _packed_training(maps: Sequence[UnpackedMap], card: MatcherCard) -> PackedTraining | None:
+    """Return what a matcher learned by what is packed with the maps; None where there is nothing for it."""
+    found = None
+    for one in maps:
+        weights = one.about.weights
+        text = None if weights is None or weights.matcher != card.name else read_learned(one.learned)
+        if weights is None or text is None:
+            continue
+        if found is not None and found.text != text:
+            raise ConfigError(
+                f"{one.file} holds other weights of {card.name!r} than the maps before it: run them one by one"
+            )
+        found = PackedTraining(text=text, places=weights.trained_on, count=weights.pairs)
+    return found
+
+
+def _key(training_set: TrainingSet | PackedTraining, result: Reply | None) -> str:
     text = None if result is None else result.learned
     hashed = f"nothing yet from {training_set.sha256}" if text is None else text
     return hashlib.sha256(hashed.encode()).hexdigest()
@@ -343,8 +387,8 @@ def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
     hidden = [path for path in hidden if not any(region.is_relative_to(path) for region in readable)]
     # Other dates of a place, and the map that a twin was edited from, would reveal the changes.
     # By where they lie: `regions` may be a link to a larger disk.
-    maps = sorted({path.resolve() for root in roots for path in (root / "regions").glob("*") if path.is_dir()})
-    hidden += [*(path for path in maps if path not in readable), *request.hidden]
+    maps = {path.resolve() for root in roots for kind in MAPS for path in root.glob(kind) if path.is_dir()}
+    hidden += [*sorted(maps - set(readable)), *request.hidden]
     return Reach(readable=readable, hidden=hidden, is_sandboxed=request.is_sandboxed)
 
 
@@ -377,7 +421,7 @@ def _part(request: RunRequest, card: MatcherCard, found: str, key: str | None, t
             f"{task.folder} is of a private seed, whose answers stay with it: "
             f"say --out {task.folder.parent.parent.parent}"
         )
-    region = task.checked_region()
+    region = _region_of(request, card, task)
     imagery = _rendered_imagery(card, region)
     settings = follower_record(card) if about.is_of_flights else None
     follower = None if settings is None else FollowerRecord(**settings)
@@ -415,6 +459,32 @@ def _part(request: RunRequest, card: MatcherCard, found: str, key: str | None, t
         follower=follower,
         key=key,
     )
+
+
+def _region_of(request: RunRequest, card: MatcherCard, task: Task) -> Path:
+    """Return the folder of a task's map: that of a packed one, or the built region."""
+    packed = next((one for one in request.maps if _is_of(task, one)), None)
+    if packed is None:
+        return task.checked_region()
+    if "imagery" in card.needs and packed.lacks_imagery:
+        raise ConfigError(
+            f"{packed.file} was packed without imagery, which {card.name!r} looks at: pack-map --with-imagery"
+        )
+    return packed.folder
+
+
+def _is_of(task: Task, packed: UnpackedMap) -> bool:
+    return task.manifest.is_of_map(read_manifest(packed.folder))
+
+
+def _check_maps(maps: Sequence[UnpackedMap], tasks: Sequence[Task]) -> None:
+    """Refuse packed maps that no task is on: of another build of a place answers would come from elsewhere."""
+    other = next((one for one in maps if not any(_is_of(task, one) for task in tasks)), None)
+    if other is not None:
+        raise ConfigError(
+            f"{other.file}, a map of {other.about.region}, is not what the queries of "
+            f"{named([str(task.folder) for task in tasks], 'task')} were made on: pack that build, or leave it out"
+        )
 
 
 def unit_of_task(about: TaskManifest) -> Callable[[str], str]:

@@ -20,6 +20,7 @@ from sasgeo_bench.core.errors import ConfigError, MatchError, counted
 from sasgeo_bench.core.plugins import ORACLE
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.matching.matcher import lacks
+from sasgeo_bench.regions.packed_map import UnpackedMap
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run, reach_of
 from sasgeo_bench.running.runner import map_bytes
@@ -39,7 +40,7 @@ class ProfileRequest:
     `spec` is a matcher's name or module:Class; `tasks` are folders of one map. Its processes and ours share `cores`
     processors, and may hold `memory_bytes`. Queries are asked one after the other, from the first again at their end,
     for `sustain_s` seconds and 20 answers at least; with `radius_m`, those alone whose prior is a disc of at most this
-    radius.
+    radius. `maps` are packed ones, as of a run.
     """
 
     spec: str
@@ -52,6 +53,7 @@ class ProfileRequest:
     top_k: int = 25
     train: Sequence[Path] = ()
     is_sandboxed: bool = True
+    maps: Sequence[UnpackedMap] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -232,6 +234,7 @@ def plan_profile(request: ProfileRequest) -> RunPlan:
             limits=limits,
             is_sandboxed=request.is_sandboxed,
             train=request.train,
+            maps=request.maps,
         )
     )
     maps = dict.fromkeys(part.region.name for part in plan.parts)
@@ -253,7 +256,7 @@ def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> tupl
                 if radius_m is None or (query.prior.radius_m is not None and query.prior.radius_m <= radius_m)
                 else f"no prior within {radius_m:g} m"
             )
-            reason = far or lacks(plan.card, query, is_taught=bool(request.train), is_pictured=is_pictured)
+            reason = far or lacks(plan.card, query, is_taught=plan.training_set is not None, is_pictured=is_pictured)
             if reason is None and len(found) < MOST_ASKED:
                 found.append(blob)
             reasons[reason or ""] += 1

@@ -16,13 +16,14 @@ from sasgeo_bench.core import progress
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.core.folders import locked
 from sasgeo_bench.core.progress import connected, done_on, tell
+from sasgeo_bench.matching.cards import write_learned
 from sasgeo_bench.matching.follower import card_on_flights
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Patience, Watch, answer, pool_costs
-from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map, unit_of_task, whole_units
+from sasgeo_bench.running.plan import MOST_LINES, PackedTraining, RunPart, RunPlan, by_map, unit_of_task, whole_units
 from sasgeo_bench.running.prediction_files import CardRecord, RunManifest
 from sasgeo_bench.running.training import trained
 
@@ -100,6 +101,9 @@ def run(plan: RunPlan) -> RunReport:
     for line in plan.training_lines() if plan.training_set is None else ():
         tell(f"{plan.card.name}: {line}")
     plan = trained(plan)
+    if isinstance(plan.training_set, PackedTraining) and plan.learned_file is not None:
+        tell(f"{plan.card.name}: trained on {plan.training_set.to_text()}")
+        write_learned(plan.learned_file, plan.training_set.text)  # `run.json` names it
     _tell_state(plan)
     for part in plan.parts:
         if not part.left and part.done and prediction_files.read_key(part.folder) != part.key:

@@ -16,7 +16,7 @@ from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.cards import read_learned, write_learned
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.running.plan import RunPlan, reach_of, with_training_result
+from sasgeo_bench.running.plan import PackedTraining, RunPlan, reach_of, with_training_result
 from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
 from sasgeo_bench.running.worker import AnyCard, Found, PluginReply, Reply, Worker, guarded
 from sasgeo_bench.sensing.segmentation import Segmentation, tables_of
@@ -35,7 +35,7 @@ def trained(plan: RunPlan) -> RunPlan:
     """
     given, path = plan.training_set, plan.learned_file
     is_pending = plan.training_result is None and any(part.left for part in plan.parts)
-    if given is None or path is None or not is_pending:
+    if isinstance(given, PackedTraining) or given is None or path is None or not is_pending:
         return plan
     with locked(path):
         text = read_learned(path)

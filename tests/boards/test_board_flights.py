@@ -234,3 +234,18 @@ def test_the_page_plays_in_a_browser_from_a_file_and_asks_nobody(out, tmp_path):
             time.sleep(0.05)
         assert [url for url in page.asked if not url.startswith(("file:", "data:"))] == []
         assert page.faults == []
+
+
+def test_the_receiver_is_checked_by_the_fixes_of_a_run(out, program, mistake):
+    code, printed, err = program("check-gnss", str(out / "runs" / "near"), "--out", str(out), "--pull-off", "2,20")
+    assert code == 0, err
+    rows = [line.split() for line in printed.splitlines()[1:] if line.strip()]
+    assert [row[:3] for row in rows] == [[SUITE, REGION, "6"]] * 2
+    assert [row[4] for row in rows] == ["0.00"] * 2  # false alarms: its fixes are 3 m off
+    assert rows[1][6] == "100%"
+    # fixes that are accepted 40 m off alarm every flight
+    printed = program("check-gnss", str(out / "runs" / "far"), "--out", str(out))[1]
+    assert float(printed.splitlines()[1].split()[4]) > 0
+    assert "--pull-off must be positive metres a second" in mistake(
+        "check-gnss", out / "runs" / "near", "--pull-off", "0"
+    )

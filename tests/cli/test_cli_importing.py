@@ -46,7 +46,7 @@ def test_a_ranking_is_scored_beside_it(program, tmp_path):
         (("import-dataset", "nowhere", "--kind", "dense-uav"), "there is no folder nowhere"),
         (("import-dataset", "set", "--kind", "uav-visloc"), "holds no satellite_coordinates_range.csv"),
         (("import-dataset", "set"), "missing option '--kind'"),
-        (("locate-dataset", "set", "--kind", "sues-200"), "holds no satellite-view"),
+        (("import-dataset", "--where", "set", "--kind", "sues-200"), "holds no satellite-view"),
     ],
 )
 def test_a_mistake_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, expected):
@@ -77,7 +77,7 @@ def test_markup_in_names_is_shown_as_it_is(program, tmp_path):
 
 def test_locate_says_where_a_set_lies_and_what_covers_it(program, tmp_path):
     writers.write_dense(tmp_path / "set", PLACES | {"000002": (9.522, 47.15)})
-    code, out, err = program("locate-dataset", "--kind", "dense-uav", "set")
+    code, out, err = program("import-dataset", "--where", "--kind", "dense-uav", "set")
     assert code == 0, err
     assert "download.geofabrik.de" in err
     lines = out.splitlines()
@@ -92,6 +92,6 @@ def test_locate_says_where_a_set_lies_and_what_covers_it(program, tmp_path):
 
 def test_a_set_without_coordinates_is_told_so(program, tmp_path):
     writers.write_university(tmp_path / "set")
-    code, out, err = program("locate-dataset", "--kind", "university-1652", "set")
+    code, out, err = program("import-dataset", "--where", "--kind", "university-1652", "set")
     assert (code, out) == (2, "")
     assert err.splitlines()[-1] == ("sasgeo-bench: University-1652 has no coordinates: no extract can be named for it")

@@ -119,6 +119,8 @@ def test_the_card_of_one_is_shown_field_by_field(kind, name, expected, program) 
     [
         (["list-matchers", "random"], ["list", "matchers", "random"]),
         (["check-tracker", "x"], ["check", "--kind", "tracker", "x"]),
+        (["propose-regions", "no.toml", "--jobs", "2"], ["new-region", "--manifest", "no.toml", "--jobs", "2"]),
+        (["locate-dataset", "--kind", "dense-uav", "x"], ["import-dataset", "--where", "--kind", "dense-uav", "x"]),
     ],
 )
 def test_the_names_of_before_still_work(old, new, program) -> None:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 import sasgeo_bench as sgb
 from sasgeo_bench.cli.observing import line_of
 from sasgeo_bench.core.errors import ConfigError, MatchError
-from sasgeo_bench.geometry.projection import to_lonlat
+from sasgeo_bench.geometry.projection import to_grid, to_lonlat
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.observing import locate as locating
 from sasgeo_bench.observing.chances import Chances, answers_for, shipped_answers
@@ -30,7 +30,10 @@ from sasgeo_bench.observing.fixes import COLUMNS, Fix, LocateRequest, verdict
 from sasgeo_bench.observing.locate import answer_key, locate, map_of
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import csv_text, page_text, write_results
+from sasgeo_bench.regions.packed_map import pack_map
 from sasgeo_bench.sensing.crops import drawn_crops
+from tests.flights.test_log_subtitles import block
+from tests.videos import write_video
 
 TOWN = "town-riverside"
 SIDE_PX, PIXEL_M = 448, 0.5
@@ -82,6 +85,30 @@ def test_a_drawn_picture_is_found_where_it_was_drawn(located, crop):
     lon, lat = to_lonlat(found.manifest.epsg).transform(fix.x_m, fix.y_m)
     assert (fix.lon, fix.lat) == pytest.approx((lon, lat), abs=1e-6)
     assert fix.p_false <= 0.1
+
+
+def test_frames_of_a_video_are_found_where_they_were_drawn(towns: Path, crop, tmp_path):
+    """A second of one picture, from so high that its pixels are as wide, with what a DJI writes beside it."""
+    manifest = sgb.read_region(towns / "regions" / TOWN).manifest
+    lon, lat = to_lonlat(manifest.epsg).transform(crop.pose.easting_m, crop.pose.northing_m)
+    heading = crop.pose.yaw_deg - to_grid(lon, lat, manifest.epsg)[2]
+    height_m = crop.pixel_m * 24.0 * math.hypot(SIDE_PX, SIDE_PX) / math.hypot(36.0, 24.0)
+    said = (
+        f"[focal_len: 24.00] [latitude: {lat:.7f}] [longitude: {lon:.7f}] [rel_alt: {height_m:.2f} abs_alt: 0.0] "
+        f"[gb_yaw: {heading:.1f} gb_pitch: -90.0 gb_roll: 0.0]"
+    )
+    video = write_video(tmp_path / "DJI_0001.MP4", [crop.rgb] * 10)
+    video.with_suffix(".SRT").write_text("".join(block(at, said, step_ms=500) for at in (1, 2, 3)))
+    found = sgb.locate(video, out=towns, into=tmp_path / "into", region=TOWN, most_false=0.1, trusted=True, every=5.0)
+    (fix,) = found.fixes
+    assert (fix.file, fix.status) == ("DJI_0001_00000.000s.jpg", "found")
+    assert off(fix, crop.pose) < 5.0
+    assert fix.file_distance_m == pytest.approx(off(fix, crop.pose), abs=0.5)
+
+
+def test_flags_of_a_video_are_refused_of_pictures(pictures: Path, towns: Path):
+    with pytest.raises(ConfigError, match=r"--every is of a video, and .* is none: leave it out"):
+        sgb.locate(pictures / "c.png", out=towns, region=TOWN, ground_width=200.0, every=2.0)
 
 
 def test_the_position_in_the_file_lies_in_the_disc_and_not_in_its_middle(located, crop):
@@ -141,6 +168,16 @@ def test_a_second_call_asks_nothing_anew_and_tries_what_failed(located, towns, p
     )
     assert asked == ["b.jpg"]
     assert [replace(fix, seconds=0.0) for fix in again.fixes] == [replace(fix, seconds=0.0) for fix in found.fixes]
+
+
+@pytest.mark.slow
+def test_a_packed_map_gives_the_same_fixes(located, towns, pictures, tmp_path):
+    pack_map(towns / "regions" / TOWN, tmp_path / "town.map")
+    width, region = SIDE_PX * PIXEL_M, str(tmp_path / "town.map")
+    words = {"ground_width": width, "region": region, "most_false": 0.1, "trusted": True}
+    found = sgb.locate(pictures, out=tmp_path / "out", into=tmp_path / "into", **words)
+    assert [replace(fix, seconds=0.0) for fix in found.fixes] == [replace(fix, seconds=0.0) for fix in located[1].fixes]
+    assert (tmp_path / "into" / "index.html").is_file()
 
 
 @pytest.mark.slow

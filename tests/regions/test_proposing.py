@@ -114,7 +114,7 @@ def test_a_line_of_a_manifest_is_a_region_that_is_built_and_knows_its_country(to
     origin = {"source": "archive of the mill, shelf 3", "date_known_by": "a stamp", "owner": "its own key"}
     listed = manifest(row(SECOND, "garden"), row(FIRST, "garden"), row(MILL, "mill", country="Elsewhere", **origin))
     into, out = tmp_path / "mine", tmp_path / "out"
-    code, printed, _ = program("propose-regions", listed, "--into", into, "--extracts", towns)
+    code, printed, _ = program("new-region", "--manifest", listed, "--into", into, "--extracts", towns)
     assert (code, printed.splitlines()) == (0, [str(into / "garden.toml"), str(into / "mill.toml")])
     garden, mill = (read_region_file(into / f"{name}.toml") for name in ("garden", "mill"))
     assert [extract.date.year for extract in garden.extract] == [2015, 2020]
@@ -134,7 +134,7 @@ def test_two_places_are_added_by_a_line_each(towns, manifest, program, tmp_path)
     ]
     into, out = tmp_path / "mine", tmp_path / "out"
     listed = manifest("extract = [", *rows, "]")
-    assert program("propose-regions", listed, "--into", into, "--extracts", towns)[0] == 0
+    assert program("new-region", "--manifest", listed, "--into", into, "--extracts", towns)[0] == 0
     assert program("build-region", "--every", "--region-files", into, "--extracts", towns, "--out", out)[0] == 0
     for place in ("garden", "mill"):
         assert read_manifest(out / "regions" / place).coverage.share > 0.3  # 600 m in the smallest window
@@ -150,7 +150,7 @@ def test_each_date_keeps_how_it_is_known_and_where_it_comes_from(towns, manifest
 
 
 def test_what_was_changed_by_hand_is_kept(towns, manifest, program, tmp_path):
-    asked = ("propose-regions", manifest(row(MILL, "mill")), "--into", tmp_path / "mine", "--extracts", towns)
+    asked = ("new-region", "--manifest", manifest(row(MILL, "mill")), "--into", tmp_path / "mine", "--extracts", towns)
     program(*asked)
     assert program(*asked)[1] == ""
     path = tmp_path / "mine" / "mill.toml"
@@ -221,7 +221,7 @@ def test_a_wrong_manifest_is_refused_in_one_line(manifest, rows, fault):
 def test_of_every_region_one_that_cannot_be_built_costs_no_other(towns, manifest, program, tmp_path):
     listed = manifest(row(MILL, "mill"), row(SECOND, "garden"))
     into, out = tmp_path / "mine", tmp_path / "out"
-    program("propose-regions", listed, "--into", into, "--extracts", towns)
+    program("new-region", "--manifest", listed, "--into", into, "--extracts", towns)
     path = into / "garden.toml"
     path.write_text(path.read_text("utf-8").replace(sha256_of(towns / SECOND), "0" * 64), encoding="utf-8")
     asked = ("build-region", "--every", "--region-files", into, "--extracts", towns, "--out", out)
@@ -234,7 +234,7 @@ def test_of_every_region_one_that_cannot_be_built_costs_no_other(towns, manifest
 
 def test_a_region_file_that_cannot_be_read_costs_no_other(towns, manifest, program, tmp_path):
     into, out = tmp_path / "mine", tmp_path / "out"
-    program("propose-regions", manifest(row(MILL, "mill")), "--into", into, "--extracts", towns)
+    program("new-region", "--manifest", manifest(row(MILL, "mill")), "--into", into, "--extracts", towns)
     (into / "a.toml").write_text("id = 3", encoding="utf-8")
     code, _, err = program("build-region", "--every", "--region-files", into, "--extracts", towns, "--out", out)
     assert code == 2
@@ -245,23 +245,29 @@ def test_a_region_file_that_cannot_be_read_costs_no_other(towns, manifest, progr
 
 def test_what_was_made_of_the_same_extracts_is_not_read_again(towns, manifest, program, tmp_path, monkeypatch):
     into, rows = tmp_path / "mine", [row(FIRST, "garden"), row(SECOND, "garden")]
-    first = program("propose-regions", manifest(*rows), "--into", into, "--extracts", towns)
+    first = program("new-region", "--manifest", manifest(*rows), "--into", into, "--extracts", towns)
     monkeypatch.setattr(proposing, "_houses", None)  # reading it would fail
-    again = program("propose-regions", manifest(*rows), "--into", into, "--extracts", towns)
+    again = program("new-region", "--manifest", manifest(*rows), "--into", into, "--extracts", towns)
     assert (first[0], again[0], again[1]) == (0, 0, "")
     assert "kept" not in again[2]
     renamed = [one.replace("garden town", "new words") for one in rows]
     assert (
         "garden.toml: kept, although the manifest gives another"
-        in (program("propose-regions", manifest(*renamed), "--into", into, "--extracts", towns)[2])
+        in (program("new-region", "--manifest", manifest(*renamed), "--into", into, "--extracts", towns)[2])
     )
 
 
 def test_a_newer_map_of_a_place_is_read(towns, manifest, program, tmp_path):
     into = tmp_path / "mine"
-    program("propose-regions", manifest(row(FIRST, "garden")), "--into", into, "--extracts", towns)
+    program("new-region", "--manifest", manifest(row(FIRST, "garden")), "--into", into, "--extracts", towns)
     err = program(
-        "propose-regions", manifest(row(FIRST, "garden"), row(SECOND, "garden")), "--into", into, "--extracts", towns
+        "new-region",
+        "--manifest",
+        manifest(row(FIRST, "garden"), row(SECOND, "garden")),
+        "--into",
+        into,
+        "--extracts",
+        towns,
     )[2]
     assert "garden.toml: kept, although the manifest gives another" in err
 
@@ -298,7 +304,7 @@ def test_origins_that_are_too_long_name_their_commits_in_short():
 def test_a_folder_that_cannot_be_written_into_is_a_line_and_nothing_is_left(towns, manifest, mistake, tmp_path):
     into = tmp_path / "mine"
     into.write_text("a file", encoding="utf-8")
-    line = mistake("propose-regions", manifest(row(MILL, "mill")), "--into", into, "--extracts", towns)
+    line = mistake("new-region", "--manifest", manifest(row(MILL, "mill")), "--into", into, "--extracts", towns)
     assert f"{into / 'mill.toml'} cannot be written" in line
     assert into.read_text(encoding="utf-8") == "a file"
 
@@ -332,3 +338,15 @@ def test_regions_are_named_or_every_one_is_built(mistake):
     line = "name regions to build, or build --every region, not both"
     assert line in mistake("build-region")
     assert line in mistake("build-region", "monaco", "--every")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--manifest", "no.toml", "--center", "9.5,47.1"), "leave center out, or leave out --manifest"),
+        (("my-town", "--manifest", "no.toml"), "leave name out, or leave out --manifest"),
+        (("--center", "9.5,47.1", "--size", "2km"), "name the region, such as my-town"),
+    ],
+)
+def test_a_place_is_named_or_a_manifest_is(mistake, words, expected):
+    assert expected in mistake("new-region", *words)

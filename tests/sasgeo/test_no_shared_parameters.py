@@ -63,7 +63,7 @@ ARGUED: Mapping[str, str] = {
     "reading.py:LEAST_SIGMA_M = 1": "half a cell of the search",
     "reading.py:MOST_SIGMA_M = 25": "the widest tolerance of the benchmark's success",
     "reading.py:_STEP_M = 4": "two cells of the search",
-    "rejectors.py:_LEAST_SHARE = 0.01": "keeps logarithms finite",
+    "rule_fitting.py:_LEAST_SHARE = 0.01": "keeps logarithms finite",
 }
 
 

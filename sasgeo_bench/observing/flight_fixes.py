@@ -110,6 +110,10 @@ def read_flight_fixes(folder: Path, *, flight: str | None = None, tasks: Path | 
         If the run, its task or its truths are missing or damaged.
     """
     if (folder / TABLE).is_file():
+        if flight is not None or tasks is not None:
+            raise ConfigError(
+                f"{folder} holds located pictures, one flight and no task: leave out --flight and --tasks"
+            )
         return _located(folder)
     run = _run_in(folder)
     manifest = RunManifest.open(run) or RunManifest()

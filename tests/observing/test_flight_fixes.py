@@ -182,5 +182,7 @@ def test_located_pictures_are_a_flight_in_the_order_of_their_cameras_clock(tmp_p
 def test_pictures_without_times_cannot_be_replayed(tmp_path):
     with pytest.raises(ConfigError, match="its cameras told no time"):
         read_flight_fixes(located(tmp_path / "a", (replace(FIX, taken_at=None),)))
+    with pytest.raises(ConfigError, match="one flight and no task: leave out --flight and --tasks"):
+        read_flight_fixes(tmp_path / "a", flight="12")
     with pytest.raises(ConfigError, match="lists no place"):
         read_flight_fixes(located(tmp_path / "b", (Fix(file="c.jpg", status="failed", reason="damaged"),)))

@@ -59,6 +59,7 @@ ONLY_PARSED = {
     r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/cli/test_cli_runs.py does it",
     r"^sasgeo-bench replay ": "needs a run over flights; tests/cli/test_cli_replay.py makes one",
     r"^sasgeo-bench import-flight ": "needs a log of the reader's own; tests/cli/test_cli_flights.py reads some",
+    r"^sasgeo-bench measure-drift .*\.ulg": "needs a log of the reader's own; tests/cli/test_cli_flights.py has some",
     r"runs/sasgeo_track|my-flight": "needs a flight of the reader's own; tests/running/test_trackers.py flies some",
     r"--train ": "needs a matcher that learns; tests/running does it",
     r"--maps ": "needs a task on that map; tests/running/test_packed_runs.py asks some",
@@ -94,7 +95,7 @@ OTHERS = {
     r"^python -m benchmarks\.related_work docs/results/": "tests/boards/test_results.py prints the same table",
     r"^(git show b92bad11|\S*python docs/ageing/measure\.py )": "needs extracts; tests/ageing/ holds what it writes",
     r"umask.*secrets\.token_hex": "makes a secret; tests/tasks/test_private_seed.py reads one",
-    r"^pip install 'sasgeo-bench\[publish\]'$": "an installation needs the package registry",
+    r"^pip install 'sasgeo-bench\[(logs|publish)\]'$": "an installation needs the package registry",
 }
 PLUGIN = """[sasgeo_bench.matchers]
 my-matcher = my_matcher.matcher:MyMatcher

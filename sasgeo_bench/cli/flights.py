@@ -39,6 +39,7 @@ AxesFlag = Annotated[
     Axes | None,
     typer.Option(help="axes of TUM files: up (third axis up), or camera (right, down, ahead: KITTI, ORB-SLAM)"),
 ]
+VehicleFlag = Annotated[int | None, typer.Option(help="system id of the vehicle in a .tlog of several")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +87,7 @@ class FlightOptions(Options):
     ] = None
     place_unit: Annotated[PlaceUnit | None, typer.Option(help="of latitude and longitude (e7: 1e-7 degrees)")] = None
     axes: AxesFlag = None
-    vehicle: Annotated[int | None, typer.Option(help="system id of the vehicle in a .tlog of several")] = None
+    vehicle: VehicleFlag = None
 
     @property
     def facts(self) -> LogFacts:
@@ -246,7 +247,7 @@ class DriftOptions(Options):
 
     logs: Annotated[
         list[Path] | None,
-        typer.Argument(help="logs: ULog, DataFlash, bags of PX4; instead of --truth and --estimate"),
+        typer.Argument(help="logs: ULog, DataFlash, .tlog, bags of PX4; instead of --truth and --estimate"),
     ] = None
     truth: Annotated[
         list[Path] | None, typer.Option(help="true trajectory, TUM format, plain or gzipped; may be repeated")
@@ -260,6 +261,7 @@ class DriftOptions(Options):
     ] = None
     lost_s: Annotated[float, typer.Option(min=0, help="seconds without a pose that are a lost stretch")] = LOST_S
     axes: AxesFlag = None
+    vehicle: VehicleFlag = None
     results: Annotated[Path | None, typer.Option(help="also write the figures into this Parquet file")] = None
     profile: Annotated[Path | None, typer.Option(help="also write a profile that was fitted, a TOML file")] = None
 
@@ -280,6 +282,8 @@ def measure_drift_command(drift: DriftOptions) -> None:
         raise FlightError("say either logs, or --truth and --estimate: drift is measured of one of them")
     lengths = drift.lengths
     _check_outputs(drift.inputs, [path for path in (drift.results, drift.profile) if path is not None])
+    if drift.vehicle is not None and not drift.logs:
+        raise FlightError("TUM files are of one vehicle: leave out --vehicle")
     if drift.logs:
         logged = _read_logs(drift)
         runs, has_yaw = (
@@ -311,7 +315,7 @@ def _read_logs(drift: DriftOptions) -> dict[Path, LoggedRuns]:
     """Read the odometry of logs, each once."""
     if drift.axes is not None:
         raise FlightError("logs have axes of their own: leave out --axes")
-    logged = {path: read_runs(path, lost_s=drift.lost_s) for path in drift.logs or []}
+    logged = {path: read_runs(path, lost_s=drift.lost_s, vehicle=drift.vehicle) for path in drift.logs or []}
     if drift.profile is not None and not all(one.has_yaw for one in logged.values()):
         raise FlightError("a profile needs headings, and the log has none but the vehicle's: leave out --profile")
     return logged

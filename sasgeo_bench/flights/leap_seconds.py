@@ -5,6 +5,9 @@ import datetime as dt
 from bisect import bisect_right
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 GPS_EPOCH_S: Final = 315_964_800  # 1980-01-06, from which GPS counts, in seconds since 1970
 WEEK_S: Final = 604_800
 
@@ -17,11 +20,11 @@ _LEAPS: Final = tuple(
         *((1994, 7), (1996, 1), (1997, 7), (1999, 1), (2006, 1), (2009, 1), (2012, 7), (2015, 7), (2017, 1)),
     )
 )
-_STARTS: Final = tuple(utc_s - GPS_EPOCH_S + count for count, utc_s in enumerate(_LEAPS, start=1))
+_STARTS: Final = np.array([utc_s - GPS_EPOCH_S + count for count, utc_s in enumerate(_LEAPS, start=1)])
 
 
-def utc_of_gps(gps_s: float) -> float:
-    """Return seconds since 1970, UTC, of seconds since 1980-01-06 as GPS counts them.
+def utc_of_gps(gps_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return seconds since 1970, UTC, of seconds since 1980-01-06 as GPS counts them, of any shape.
 
     A time within a leap second is that of the second after it, as clocks of Unix have it.
 
@@ -29,26 +32,19 @@ def utc_of_gps(gps_s: float) -> float:
     --------
     A flight in 2014 is 16 seconds behind the count of GPS, one in 2025 by 18:
 
-    >>> [utc_of_gps(week * WEEK_S) - (GPS_EPOCH_S + week * WEEK_S) for week in (1800, 2350)]
-    [-16, -18]
+    >>> weeks = np.array([1800.0, 2350.0])
+    >>> (utc_of_gps(weeks * WEEK_S) - (GPS_EPOCH_S + weeks * WEEK_S)).tolist()
+    [-16.0, -18.0]
     """
-    return GPS_EPOCH_S + gps_s - bisect_right(_STARTS, gps_s)
-
-
-def utc_of_week(week: int, week_s: float) -> float:
-    """Return seconds since 1970, UTC, of a week of GPS that is not wrapped and the seconds in it.
-
-    >>> dt.datetime.fromtimestamp(utc_of_week(2350, 86_400.5), tz=dt.UTC).isoformat()
-    '2025-01-19T23:59:42.500000+00:00'
-    """
-    return utc_of_gps(week * WEEK_S + week_s)
+    return np.asarray(GPS_EPOCH_S + gps_s - np.searchsorted(_STARTS, gps_s, side="right"))
 
 
 def week_of_utc(utc_s: float) -> tuple[int, int]:
     """Return the week of GPS, not wrapped, and the milliseconds in it, of seconds since 1970, UTC.
 
-    >>> week_of_utc(utc_of_week(2350, 86_400.5))
-    (2350, 86400500)
+    >>> week, week_ms = week_of_utc(dt.datetime(2025, 1, 19, 23, 59, 42, 500_000, tzinfo=dt.UTC).timestamp())
+    >>> week, week_ms, utc_of_gps(np.array(week * WEEK_S + week_ms / 1000)).item() - GPS_EPOCH_S - week * WEEK_S
+    (2350, 86400500, 86382.5)
     """
     gps_ms = round((utc_s - GPS_EPOCH_S + bisect_right(_LEAPS, utc_s)) * 1000)
     return divmod(gps_ms, WEEK_S * 1000)

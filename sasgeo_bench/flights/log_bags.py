@@ -155,9 +155,9 @@ class _Bag:
         return sorted(found, key=lambda one: one.topic)
 
     def table(self, connection: "Connection", paths: Sequence[str]) -> "_Table":
-        """Return the messages of a topic, with the values at some paths of attributes; arrays there are spread."""
+        """Return the messages of a topic, with the values at some paths of attributes; whole arrays are spread."""
         recorded, stamps, values = array("q"), array("q"), array("d")
-        getters = [attrgetter(path) for path in paths]
+        getters = [_getter(path) for path in paths]
         width = 0
         with library(self.source, _FAULTS, mend=_MEND):
             for one, recorded_ns, data in self.reader.messages([connection]):
@@ -191,6 +191,13 @@ class _Table:
     def is_stamped(self) -> bool:
         """Return whether every header has its time."""
         return bool((self.stamps_ns > 0).all())
+
+
+def _getter(path: str) -> Callable[[object], Any]:
+    """Return what gets the value at a path, of an array one by its number."""
+    name, _, number = path.rstrip("]").partition("[")
+    get = attrgetter(name)
+    return (lambda message: get(message)[int(number)]) if number else get
 
 
 def _stamp_ns(message: Any) -> int:  # noqa: ANN401 - of a type that the bag brings along
@@ -271,12 +278,12 @@ def _ros_streams(bag: _Bag) -> Streams:
 
 
 _PLACE_FIELDS: Final = ("longitude", "latitude", "altitude")
-_FIX_FIELDS: Final = (*_PLACE_FIELDS, "status.status", "position_covariance_type", "position_covariance")
+_FIX_FIELDS: Final = (*_PLACE_FIELDS, "status.status", "position_covariance_type", "position_covariance[0]")
 
 
 def _fixes_of_ros(source: LogSource, table: _Table, time_s: Floats, *, is_estimate: bool = False) -> Fixes:
     """Return the fixes of a NavSatFix: altitudes above the ellipsoid, no fix below 0."""
-    lon, lat, alt, status, kind, variance_m2, *_ = table.values.T
+    lon, lat, alt, status, kind, variance_m2 = table.values.T
     is_fix = status >= 0
     stated_m2 = variance_m2[is_fix & (kind > 0) & (variance_m2 > 0)]
     return Fixes.of(

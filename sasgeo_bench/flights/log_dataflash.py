@@ -6,7 +6,8 @@ second), height `POS.RelHomeAlt`, attitude `ATT`. https://ardupilot.org/copter/d
 """
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,12 +58,13 @@ class Messages:
             if columns:
                 yield name, columns
             return
-        for number in np.unique(numbers).tolist():
-            is_it = numbers == number
+        found = np.unique(numbers).tolist()
+        for number in found:
+            is_it = numbers == number if len(found) > 1 else slice(None)
             yield f"{name} {number:.0f}", {key: values[is_it] for key, values in columns.items()}
 
 
-def read_messages(path: Path, names: Sequence[str]) -> Messages:
+def read_messages(path: Path, names: Sequence[str], fields: Collection[str] | None = None) -> Messages:
     """Read messages of a DataFlash log, binary or text.
 
     Parameters
@@ -71,6 +73,8 @@ def read_messages(path: Path, names: Sequence[str]) -> Messages:
         Of 2 GiB at most.
     names : sequence of str
         Messages; others are passed over.
+    fields : collection of str, optional
+        Fields of any of them; by default all that are numbers.
 
     Returns
     -------
@@ -95,9 +99,9 @@ def read_messages(path: Path, names: Sequence[str]) -> Messages:
             is_binary = file.read(2) == bytes((0xA3, 0x95))
         if not is_binary:
             reader = DFReader.DFReader_text(str(path))
-            return Messages(source=source, messages=_of_text(reader, names), parameters=dict(reader.params))
+            return Messages(source=source, messages=_of_text(reader, names, fields), parameters=dict(reader.params))
         with DFReader.DFReader_binary(str(path)) as reader:
-            found = {name: columns for name in names if (columns := _of_binary(reader, name))}
+            found = {name: columns for name in names if (columns := _of_binary(reader, name, fields))}
             notes, parameters = tuple(_damages(reader)), dict(reader.params)
     return Messages(source=source, messages=found, notes=notes, parameters=parameters)
 
@@ -115,7 +119,11 @@ def _silent() -> Iterator[None]:
         os.close(nothing)
 
 
-def _of_binary(reader: Any, name: str) -> dict[str, Floats]:  # noqa: ANN401 - of a library without types
+def _of_binary(
+    reader: Any,  # noqa: ANN401 - of a library without types
+    name: str,
+    fields: Collection[str] | None,
+) -> dict[str, Floats]:
     """Return all messages of one name at once: the library knows where each lies, and their format."""
     if name not in reader.name_to_id:
         return {}
@@ -132,7 +140,7 @@ def _of_binary(reader: Any, name: str) -> dict[str, Floats]:  # noqa: ANN401 - o
     return {
         column: table[column].astype(np.float64) / (1 / factor if factor else 1.0)
         for column, kind, factor in zip(layout.columns, kinds, layout.msg_mults, strict=True)
-        if kind[0] != "S"
+        if kind[0] != "S" and (fields is None or column in fields)
     }
 
 
@@ -161,23 +169,32 @@ def _damages(reader: Any) -> Iterator[str]:  # noqa: ANN401 - of a library witho
         yield f"damaged: {between} bytes that are no message are passed over"
 
 
-def _of_text(reader: Any, names: Sequence[str]) -> dict[str, dict[str, Floats]]:  # noqa: ANN401 - of a library without types
-    found: dict[str, list[list[float]]] = {}
+def _of_text(
+    reader: Any,  # noqa: ANN401 - of a library without types
+    names: Sequence[str],
+    fields: Collection[str] | None,
+) -> dict[str, dict[str, Floats]]:
+    found: dict[str, array[float]] = {}
     columns: dict[str, list[str]] = {}
     while (message := reader.recv_match(type=list(names))) is not None:
         name = message.get_type()
-        values = [getattr(message, column) for column in message.get_fieldnames()]
-        kept = columns.setdefault(
-            name, [column for column, value in zip(message.get_fieldnames(), values, strict=True) if _is_number(value)]
-        )
-        found.setdefault(name, []).append([float(getattr(message, column)) for column in kept])
-    return {name: dict(zip(columns[name], np.array(rows).T, strict=True)) for name, rows in found.items()}
+        if name not in columns:
+            wanted = [one for one in message.get_fieldnames() if fields is None or one in fields]
+            columns[name] = [one for one in wanted if isinstance(getattr(message, one), int | float)]
+        found.setdefault(name, array("d")).extend(float(getattr(message, one)) for one in columns[name])
+    return {
+        name: dict(zip(columns[name], np.array(values).reshape(-1, len(columns[name])).T, strict=True))
+        for name, values in found.items()
+    }
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float)
-
-
+FIELDS: Final = frozenset(
+    {
+        *("TimeUS", "TimeMS", "T", "I", "C", "Status", "GMS", "GWk", "Week", "Lat", "Lng", "Alt", "HAcc", "RelHomeAlt"),
+        *("Yaw", "Pitch", "Roll", "PN", "PE", "PD", "SS", "PI", "PX", "PY", "PZ", "R", "P", "Y"),
+        *(f"{what}D{axis}" for what in ("Ang", "Pos") for axis in "XYZ"),
+    }
+)
 OF_DRIFT: Final = ("GPS", "GPS2", "GPA", "ATT", "XKF1", "XKF4", "NKF1", "NKF4", "VISP", "VISO")
 # Bits of the status of the filter, and the source that is a receiver: AP_NavEKF, AP_NavEKF_Source of ArduPilot.
 _HELD: Final = 7
@@ -187,10 +204,13 @@ _OF_GPS: Final = 3
 
 def read_dataflash(path: Path) -> FlightLog:
     """Read the flight of a DataFlash log; raise `FlightError` if it has no places, or is not sound."""
-    messages = read_messages(path, ("GPS", "GPS2", "GPA", "POS", "ATT"))
+    return flight_of(*_read(path))  # the messages are let go before
+
+
+def _read(path: Path) -> tuple[LogSource, Streams]:
+    messages = read_messages(path, ("GPS", "GPS2", "GPA", "POS", "ATT"), FIELDS)
     with known_fields(messages.source):
-        streams = _streams_of(messages)
-    return flight_of(messages.source, streams)
+        return messages.source, _streams_of(messages)
 
 
 def seconds(columns: Columns) -> Floats:
@@ -300,19 +320,21 @@ def _streams_of(messages: Messages) -> Streams:
         fixes=fixes,
         heights=heights,
         attitudes=attitudes_of(messages),
-        clock=_clock(messages),
+        clock=_clock(messages, fixes.track.name),
         notes=(*notes, *messages.notes),
     )
 
 
-def _clock(messages: Messages) -> Clock | None:
-    """Return UTC by weeks of GPS; a receiver without a week does not know it yet."""
-    for name, columns in (*messages.instances("GPS"), *messages.instances("GPS2")):
+def _clock(messages: Messages, first: str) -> Clock | None:
+    """Return UTC by weeks of the receiver that is read, else of another; one without a week does not know it yet."""
+    receivers = dict((*messages.instances("GPS"), *messages.instances("GPS2")))
+    for name in sorted(receivers, key=lambda name: name != first):
+        columns = receivers[name]
         week, ms = (columns.get(new, columns.get(old)) for new, old in (("GWk", "Week"), ("GMS", "TimeMS")))
         if week is None or ms is None or not (week > 0).any():
             continue
         gps_s = week[week > 0] * WEEK_S + ms[week > 0] / 1e3
-        utc_s = np.array([utc_of_gps(one) for one in gps_s.tolist()])
+        utc_s = utc_of_gps(gps_s)
         leaps = round(float(GPS_EPOCH_S + gps_s[0] - utc_s[0]))
         called = f"weeks of {name} less {leaps} leap seconds"
         return Clock(name=called, time_s=seconds(columns)[week > 0], utc_s=utc_s)

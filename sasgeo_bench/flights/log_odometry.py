@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.core.errors import FlightError, counted
-from sasgeo_bench.flights import log_bags, log_dataflash, log_ulog
+from sasgeo_bench.flights import log_bags, log_dataflash, log_telemetry, log_ulog
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, pair_run
 from sasgeo_bench.flights.log_points import LogSource
 from sasgeo_bench.flights.log_streams import (
@@ -33,7 +33,7 @@ from sasgeo_bench.flights.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-SUFFIXES: Final = (".ulg", ".bin", ".log")  # and bags of PX4
+SUFFIXES: Final = (".ulg", ".bin", ".log", ".tlog")  # and bags of PX4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,15 +60,17 @@ class LoggedRuns:
     notes: tuple[str, ...]
 
 
-def read_runs(path: Path, *, lost_s: float = LOST_S) -> LoggedRuns:
+def read_runs(path: Path, *, lost_s: float = LOST_S, vehicle: int | None = None) -> LoggedRuns:
     """Read the odometry of a log with the truth of its receiver.
 
     Parameters
     ----------
     path : Path
-        ULog, DataFlash, or a bag with PX4's own messages.
+        ULog, DataFlash, telemetry, or a bag with PX4's own messages.
     lost_s : float
         As `drift.pair_run` takes it.
+    vehicle : int, optional
+        System id of the vehicle in telemetry of several.
 
     Returns
     -------
@@ -81,7 +83,7 @@ def read_runs(path: Path, *, lost_s: float = LOST_S) -> LoggedRuns:
         If the log has no fixes of a receiver, no odometry, or none that fused no receiver; the message names what it
         has, and the flags that tell.
     """
-    log = _read(path)
+    log = _read(path, vehicle)
     poses = log.estimate.poses
     has_yaw = log.estimate.has_attitudes
     if log.attitudes is None and has_yaw:
@@ -138,8 +140,19 @@ class _Log:
         )
 
 
-def _read(path: Path) -> _Log:
+def _read(path: Path, vehicle: int | None) -> _Log:
     suffix = path.suffix.lower()
+    if suffix == ".tlog":
+        telemetry = log_telemetry.read_telemetry(path, vehicle=vehicle)
+        return _Log.of(
+            telemetry.source,
+            log_telemetry.fixes_of(telemetry),
+            log_telemetry.estimates_of(telemetry),
+            log_telemetry.attitudes_of(telemetry),
+            telemetry.notes,
+        )
+    if vehicle is not None:
+        raise FlightError(f"{path.name} is no telemetry log: leave out --vehicle")
     if suffix == ".ulg":
         return _of_px4(log_ulog.read_topics(path, log_ulog.OF_DRIFT))
     if log_bags.is_bag(path):
@@ -150,7 +163,7 @@ def _read(path: Path) -> _Log:
             f"{path.name or path} is no log with odometry that is read: {', '.join(SUFFIXES)} are, and bags of PX4 "
             f"({bags}); trajectories in TUM files go by --truth and --estimate"
         )
-    messages = log_dataflash.read_messages(path, log_dataflash.OF_DRIFT)
+    messages = log_dataflash.read_messages(path, log_dataflash.OF_DRIFT, log_dataflash.FIELDS)
     with known_fields(messages.source):
         return _Log.of(
             messages.source,

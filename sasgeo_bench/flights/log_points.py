@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 # What an altitude counts from: the geoid, which is the sea; the ellipsoid of WGS 84; or what the file does not say.
 AltitudeOf = Literal["geoid", "ellipsoid", "unknown"]
 
-MOST_BYTES: Final = 64 * 2**20  # of a log
+MOST_BYTES: Final = 256 * 2**20  # of text, where a million points with names and speeds take 200 MB
 MOST_POINTS: Final = 1_000_000
 BEFORE_FIX: Final = "at 0, 0 before the first fix"
 
@@ -61,17 +61,18 @@ class LogSource:
 
     def number(self, text: str | None, name: str, number: int) -> float:
         """Return a finite number out of the file; raise `FlightError` for anything else."""
-        if text is None or not text.strip():
-            message = f"{name} is missing: complete the point, or delete it"
-            raise self.fault(message, number)
         try:
-            value = math.nan if "_" in text else float(text)
+            value = float(text or "nan")
         except ValueError:
             value = math.nan
-        if not abs(value) < 1e30:  # a number beyond is a fault; times in ns are 2e18
+        # a number beyond is a fault; times in ns are 2e18
+        if abs(value) < 1e30 and "_" not in (text or ""):
+            return value
+        if text is None or not text.strip():
+            message = f"{name} is missing: complete the point, or delete it"
+        else:
             message = f"{name} is no number, {shown(text)}: mend the value (decimals with a point), or delete the point"
-            raise self.fault(message, number)
-        return value
+        raise self.fault(message, number)
 
     def moment(self, text: str | None, number: int) -> float:
         """Return a time as ISO 8601 has it, in seconds since 1970; one without a zone is UTC."""
@@ -83,7 +84,7 @@ class LogSource:
         return (moment if moment.tzinfo else moment.replace(tzinfo=dt.UTC)).timestamp()
 
     def check_size(self, most: int | None = None) -> None:
-        """Raise `FlightError` if there is no such file, or if it is larger than so many bytes (64 MiB)."""
+        """Raise `FlightError` if there is no such file, or if it is larger than so many bytes (256 MiB)."""
         if not self.path.is_file():
             raise FlightError(f"there is no flight log {self.path}: check the path")
         size = self.path.stat().st_size
@@ -294,7 +295,7 @@ def tell_left_out(source: LogSource, count: int, which: str) -> None:
 
 _POINTS: Final = ("trkpt", "rtept")  # of a track and of a route
 _DEEPEST: Final = 64  # elements in each other
-_MOST_ELEMENTS: Final = 3_000_000  # of a file: others than tracks take the time of a million points at most
+_MOST_ELEMENTS: Final = 10_000_000  # of a file: others than tracks take the time of a million points at most
 _LONG_TAG: Final = re.compile(rb"<[^<>]{100000}")  # attributes without end take minutes
 # Modes of KML's altitudes; the others are of the sea's floor, or of none.
 _ABOVE_GROUND: Final = "relativeToGround"
@@ -356,15 +357,18 @@ def read_gpx(path: Path) -> FlightLog:
     """
     track, route = _Track(source=LogSource(path=path)), _Track(source=LogSource(path=path))
     counts = Counter[str]()
-    for event, element, parent in _elements(track.source):
-        name = _name(element)
-        counts[name] += event == "start" and name in ("trk", "rte")
-        if event == "start" and name in _POINTS:
-            _add_place(track if name == _POINTS[0] else route, [element.get("lon"), element.get("lat")])
-        elif event == "end" and name == "time" and parent in _POINTS:
-            _add_time(track if parent == _POINTS[0] else route, element.text)
-        elif event == "end" and name == "ele" and parent in _POINTS:
-            _add_altitude(track if parent == _POINTS[0] else route, element.text)
+    lines = dict(zip(_POINTS, (track, route), strict=True))
+    for event, element, name, parent in _elements(track.source):
+        if event == "start":
+            if name in lines:
+                _add_place(lines[name], (element.get("lon"), element.get("lat")))
+            else:
+                counts[name] += 1
+        elif parent in lines:
+            if name == "time":
+                _add_time(lines[parent], element.text)
+            elif name == "ele":
+                _add_altitude(lines[parent], element.text)
     kind, read = ("trk", track) if len(track) or not len(route) else ("rte", route)
     if counts[kind] > 1:
         raise track.source.fault(f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant")
@@ -382,8 +386,8 @@ def read_kml(path: Path) -> FlightLog:
     has_zone = True
     opened = ""  # times and places of other elements are not of the line
     texts: dict[str, str] = {}
-    for event, element, parent in _elements(source):
-        name, text = _name(element), element.text or ""
+    for event, element, name, parent in _elements(source):
+        text = element.text or ""
         if event == "start":
             if name in ("LineString", "Track"):
                 lines.append(_Track(source=source))
@@ -428,7 +432,8 @@ def _close(line: _Track, coordinates: str, mode: str) -> None:
 
 def _add_time(line: _Track, text: str | None) -> None:
     number = len(line.moments) + 1
-    line.source.check_count(number)
+    if number > MOST_POINTS:
+        line.source.check_count(number)
     line.moments.append(line.source.moment(text, number))
 
 
@@ -442,38 +447,43 @@ def _add_altitude(line: _Track, text: str | None) -> None:
 
 def _add_place(line: _Track, parts: Sequence[str | None]) -> None:
     number = len(line) + 1
-    line.source.check_count(number)
+    if number > MOST_POINTS:
+        line.source.check_count(number)
     if len(parts) not in (2, 3):
         message = f"{shown(' '.join(map(str, parts)))} is no longitude, latitude and altitude: mend the coordinates"
         raise line.source.fault(message, number)
-    lon_deg, lat_deg, *height_m = (
-        line.source.number(text, name, number)
-        for text, name in zip(parts, ("longitude", "latitude", "altitude"), strict=False)
-    )
-    line.lon_deg.append(lon_deg)
-    line.lat_deg.append(lat_deg)
-    line.heights_m.extend(height_m)
+    line.lon_deg.append(line.source.number(parts[0], "longitude", number))
+    line.lat_deg.append(line.source.number(parts[1], "latitude", number))
+    if len(parts) > 2:  # with a height
+        line.heights_m.append(line.source.number(parts[2], "altitude", number))
 
 
-def _elements(source: LogSource) -> Iterator[tuple[str, Element, str]]:
-    """Yield elements, with the name of what they stand in, as they begin and end; keep none of them in memory."""
+def _elements(source: LogSource) -> Iterator[tuple[str, Element, str, str]]:
+    """Yield elements, with their names and those of what they stand in, as they begin and end; keep none in memory."""
     # Refuse document types and entities, what is larger or nests deeper than any track, and what is no XML.
-    open_ones: list[Element] = []
+    open_ones: list[tuple[Element, str]] = []
+    parent = ""
+    names: dict[str, str] = {}  # of tags, without their namespaces
     count = 0
     try:
         for event, element in iterparse(io.BytesIO(_content(source)), events=("start", "end"), forbid_dtd=True):
-            if event == "end":
-                open_ones.pop()
-            yield event, element, _name(open_ones[-1]) if open_ones else ""
             if event == "start":
-                open_ones.append(element)
+                tag = element.tag
+                name = names.get(tag) or names.setdefault(tag, tag.rpartition("}")[2])
+                yield event, element, name, parent
+                open_ones.append((element, name))
+                parent = name
                 count += 1
-            elif open_ones:
-                open_ones[-1].remove(element)
-            if len(open_ones) > _DEEPEST or count > _MOST_ELEMENTS:
-                raise source.fault(
-                    f"more than {_MOST_ELEMENTS} elements, or {_DEEPEST} in each other: keep the track alone"
-                )
+                if len(open_ones) > _DEEPEST or count > _MOST_ELEMENTS:
+                    raise source.fault(
+                        f"more than {_MOST_ELEMENTS} elements, or {_DEEPEST} in each other: keep the track alone"
+                    )
+                continue
+            _, name = open_ones.pop()
+            parent = open_ones[-1][1] if open_ones else ""
+            yield event, element, name, parent
+            if open_ones:
+                open_ones[-1][0].remove(element)
     except FlightError:
         raise
     except DefusedXmlException as error:
@@ -511,8 +521,3 @@ def _unzipped(source: LogSource, content: bytes) -> bytes:
     if len(unzipped) > MOST_BYTES:
         raise source.fault(f"more than {MOST_BYTES} bytes unpacked: keep the track alone")
     return unzipped
-
-
-def _name(element: Element) -> str:
-    """Return the name of an element without its namespace."""
-    return str(element.tag).rpartition("}")[2]

@@ -407,11 +407,11 @@ def _start_s(layout: Layout, whole: Floats, values: dict[str, Floats], table: _T
         # 1e9: a clock that has never been set counts from its start
         return first if key in layout.format.epoch and first > 1e9 else None
     if _WEEK.fullmatch(text):
-        return utc_of_gps(first)
+        return float(utc_of_gps(np.array(first)))
     if not _DATED.match(text):
         return None
     if key in layout.format.gps:
-        return utc_of_gps(first - GPS_EPOCH_S)
+        return float(utc_of_gps(np.array(first - GPS_EPOCH_S)))
     return first if _ZONED.search(text) or "utc" in key.split("_") else None
 
 

@@ -6,9 +6,12 @@ Which message is read: `GPS_RAW_INT`, and only where it has no fixes the estimat
 late. https://mavlink.io/en/messages/common.html
 """
 
+import mmap
 import struct
+from array import array
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +25,7 @@ from sasgeo_bench.flights.log_streams import (
     LEAST_FIX,
     MOST_LOG_BYTES,
     Clock,
+    Estimate,
     Fixes,
     Stream,
     Streams,
@@ -29,17 +33,22 @@ from sasgeo_bench.flights.log_streams import (
     flight_of,
     library,
     quaternions_of_angles,
+    quaternions_of_ned,
 )
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, Floats]
-Rows = dict[tuple[int, int, str], list[tuple[float, ...]]]  # by system, component and message
+Rows = dict[tuple[int, int, str], "array[float]"]  # by system, component and message
 
 SYSTEM_TIME: Final = "SYSTEM_TIME"
 GPS_RAW: Final = "GPS_RAW_INT"
 POSITION: Final = "GLOBAL_POSITION_INT"
 ATTITUDE: Final = "ATTITUDE"
+ODOMETRY: Final = "ODOMETRY"
+VISION: Final = "VISION_POSITION_ESTIMATE"
 
+# Of MAV_ESTIMATOR_TYPE: vision, with inertial sensors, lidar. Others fused a receiver, or do not say so.
+_WITHOUT_GNSS: Final = (2, 3, 7)
 _EPOCH_S: Final = 1e9  # a clock that counts from the start of an autopilot never comes there
 _V1, _V2 = 0xFE, 0xFD
 _FAULTS: Final = (struct.error, ValueError, KeyError, IndexError, TypeError, AttributeError)  # of a damaged packet
@@ -48,10 +57,14 @@ _STAMP: Final = 8  # bytes of the time before each packet
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Telemetry:
-    """Messages of one vehicle in a telemetry log: by name, their `FIELDS` and `received`, seconds since 1970."""
+    """Messages of one vehicle in a telemetry log: by name, their `FIELDS` and `received`, seconds since 1970.
+
+    `odometry` has those of `ODOMETRY` and `VISION_POSITION_ESTIMATE` of every component, which most are a companion's.
+    """
 
     source: LogSource
     messages: dict[str, dict[str, Floats]]
+    odometry: dict[tuple[str, int], dict[str, Floats]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
 
@@ -61,6 +74,8 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     GPS_RAW: ("time_usec", "fix_type", "lat", "lon", "alt", "h_acc"),
     POSITION: ("time_boot_ms", "lat", "lon", "alt", "relative_alt"),
     ATTITUDE: ("time_boot_ms", "yaw", "pitch", "roll"),
+    ODOMETRY: ("time_usec", "estimator_type", "x", "y", "z", "q[0]", "q[1]", "q[2]", "q[3]"),
+    VISION: ("usec", "x", "y", "z", "roll", "pitch", "yaw"),
 }
 _PLACES: Final = (GPS_RAW, POSITION)
 
@@ -94,11 +109,12 @@ def read_telemetry(path: Path, *, vehicle: int | None = None) -> Telemetry:
     source = LogSource(path=path, unit="fix")
     source.check_size(MOST_LOG_BYTES)
     numbers = {getattr(common, f"MAVLINK_MSG_ID_{name}"): name for name in FIELDS}
+    attributes = {name: dict.fromkeys(one.partition("[")[0] for one in fields) for name, fields in FIELDS.items()}
     link = common.MAVLink(None)
     rows: Rows = {}
     damaged = 0
-    with library(source, (OSError,)):
-        packets = _Packets(plain_file(path).read_bytes())
+    with library(source, (OSError,)), _mapped(path) as content:
+        packets = _Packets(content)
         for stamp_us, packet, number, system, component in packets:
             name = numbers.get(number)
             if name is None:
@@ -108,20 +124,37 @@ def read_telemetry(path: Path, *, vehicle: int | None = None) -> Telemetry:
             except (common.MAVError, *_FAULTS):
                 damaged += 1
                 continue
-            values = (stamp_us / 1e6, *(float(getattr(message, field)) for field in FIELDS[name]))
-            rows.setdefault((system, component, name), []).append(values)
+            values = [getattr(message, one) for one in attributes[name]]
+            row = rows.setdefault((system, component, name), array("d"))
+            row.append(stamp_us / 1e6)
+            for value in values:
+                row.extend(value) if isinstance(value, list) else row.append(value)
     system, component = _vehicle_of(source, rows, vehicle)
-    messages = {}
-    for name, fields in FIELDS.items():
-        table = rows.get((system, component, name))
-        if table:
-            messages[name] = dict(zip(("received", *fields), np.array(table).T, strict=True))
+    tables = {(name, by): _columns(name, row) for (one, by, name), row in rows.items() if one == system}
+    messages = {name: columns for (name, by), columns in tables.items() if by == component}
+    odometry = {key: columns for key, columns in sorted(tables.items()) if key[0] in (ODOMETRY, VISION)}
     notes: tuple[str, ...] = (f"vehicle {system}, component {component}",)
     if damaged or packets.skipped:
         notes += (f"damaged: {damaged} messages and {packets.skipped} bytes beside that are passed over",)
     if packets.is_cut:
         notes += ("cut off: the file ends within a message, and is read up to there",)
-    return Telemetry(source=source, messages=messages, notes=notes)
+    return Telemetry(source=source, messages=messages, odometry=odometry, notes=notes)
+
+
+def _columns(name: str, row: "array[float]") -> dict[str, Floats]:
+    fields = ("received", *FIELDS[name])
+    return dict(zip(fields, np.array(row).reshape(-1, len(fields)).T, strict=True))
+
+
+@contextmanager
+def _mapped(path: Path) -> Iterator[mmap.mmap | bytes]:
+    """Map a file, so that no more of it is in memory than the system likes; an empty one cannot be."""
+    with plain_file(path).open("rb") as file:
+        if not path.stat().st_size:
+            yield b""
+            return
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            yield content
 
 
 def _vehicle_of(source: LogSource, rows: Rows, vehicle: int | None) -> tuple[int, int]:
@@ -142,7 +175,7 @@ def _vehicle_of(source: LogSource, rows: Rows, vehicle: int | None) -> tuple[int
 class _Packets:
     """Packets of a telemetry log, with time, message, system and component; what is none is skipped and counted."""
 
-    content: bytes
+    content: mmap.mmap | bytes
     skipped: int = 0
     is_cut: bool = False
 
@@ -169,7 +202,7 @@ class _Packets:
         self.is_cut = at < end
 
 
-def _length(content: bytes, start: int) -> int:
+def _length(content: mmap.mmap | bytes, start: int) -> int:
     """Return how many bytes the packet at a place has; 0 if none begins there."""
     if content[start] == _V1:
         return content[start + 1] + 8 if start + 1 < len(content) else 8
@@ -180,7 +213,7 @@ def _length(content: bytes, start: int) -> int:
     return 0
 
 
-def _begins(content: bytes, at: int) -> bool:
+def _begins(content: mmap.mmap | bytes, at: int) -> bool:
     """Return whether a packet begins behind a time there, or the log ends within it."""
     return at + _STAMP >= len(content) or content[at + _STAMP] in (_V1, _V2)
 
@@ -194,39 +227,81 @@ def read_tlog(path: Path, *, vehicle: int | None = None) -> FlightLog:
 def streams_of(telemetry: Telemetry) -> Streams:
     """Return what a flight is made of, out of the messages of a vehicle."""
     source, messages = telemetry.source, telemetry.messages
-    found = []
-    if GPS_RAW in messages:
-        gps = messages[GPS_RAW]
-        stated_m = gps["h_acc"][gps["h_acc"] > 0] / 1e3
-        found.append(
-            Fixes.of(
-                source,
-                GPS_RAW,
-                _gps_seconds(messages),
-                (gps["lon"] / 1e7, gps["lat"] / 1e7, gps["alt"] / 1e3),
-                gps["fix_type"] >= LEAST_FIX,
-                accuracy_m=float(np.median(stated_m)) if len(stated_m) else np.nan,
-            )
-        )
-    position, heights, attitudes = messages.get(POSITION), None, None
+    found = _receivers(telemetry)
+    position, heights = messages.get(POSITION), None
     if position is not None:
         time_s = position["time_boot_ms"] / 1e3
         places = (position["lon"] / 1e7, position["lat"] / 1e7, position["alt"] / 1e3)
         found.append(Fixes.of(source, POSITION, time_s, places, np.ones(len(time_s), dtype=bool), is_estimate=True))
         name = f"{POSITION}.relative_alt"
         heights = Stream.of(source, name, time_s, position["relative_alt"][:, None] / 1e3)
-    if ATTITUDE in messages:
-        attitude = messages[ATTITUDE]
-        turns = quaternions_of_angles(*(np.degrees(attitude[name]) for name in ("yaw", "pitch", "roll")))
-        attitudes = Stream.of(source, ATTITUDE, attitude["time_boot_ms"] / 1e3, turns)
     fixes, notes = first_with_fixes(source, found, " or ".join(_PLACES))
     return Streams(
         fixes=fixes,
         heights=heights,
-        attitudes=attitudes,
+        attitudes=attitudes_of(telemetry),
         clock=_utc(messages),
         notes=(*notes, *telemetry.notes),
     )
+
+
+def _receivers(telemetry: Telemetry) -> list[Fixes]:
+    gps = telemetry.messages.get(GPS_RAW)
+    if gps is None:
+        return []
+    stated_m = gps["h_acc"][gps["h_acc"] > 0] / 1e3
+    places = (gps["lon"] / 1e7, gps["lat"] / 1e7, gps["alt"] / 1e3)
+    fixes = Fixes.of(
+        telemetry.source,
+        GPS_RAW,
+        _on_boot(telemetry.messages, gps["time_usec"] / 1e6, gps["received"]),
+        places,
+        gps["fix_type"] >= LEAST_FIX,
+        accuracy_m=float(np.median(stated_m)) if len(stated_m) else np.nan,
+    )
+    return [fixes]
+
+
+def fixes_of(telemetry: Telemetry) -> tuple[Fixes, tuple[str, ...]]:
+    """Return the fixes of the receiver; raise `FlightError` if there are none."""
+    return first_with_fixes(telemetry.source, _receivers(telemetry), GPS_RAW)
+
+
+def attitudes_of(telemetry: Telemetry) -> Stream | None:
+    """Return the attitudes of the vehicle; none if it sent none."""
+    attitude = telemetry.messages.get(ATTITUDE)
+    if attitude is None:
+        return None
+    turns = quaternions_of_angles(*(np.degrees(attitude[name]) for name in ("yaw", "pitch", "roll")))
+    return Stream.of(telemetry.source, ATTITUDE, attitude["time_boot_ms"] / 1e3, turns)
+
+
+def estimates_of(telemetry: Telemetry) -> list[Estimate]:
+    """Return what may be odometry: poses that a camera's or a lidar's estimator sent.
+
+    Raise `FlightError` if all that was sent fused a receiver, or does not say that it did not.
+    """
+    found, refused = [], []
+    for (name, component), columns in telemetry.odometry.items():
+        called = f"{name} of component {component}"
+        if name == ODOMETRY:
+            is_free = np.isin(columns["estimator_type"], _WITHOUT_GNSS)
+            if not is_free.all():
+                refused.append(f"{called} (estimator_type {columns['estimator_type'][~is_free][0]:.0f})")
+                continue
+            turns = quaternions_of_ned(*(columns[f"q[{at}]"] for at in range(4)))
+        else:
+            turns = quaternions_of_angles(*(np.degrees(columns[key]) for key in ("yaw", "pitch", "roll")))
+        own_s = columns["time_usec" if name == ODOMETRY else "usec"] / 1e6
+        time_s = _on_boot(telemetry.messages, own_s, columns["received"], is_own=False)
+        poses = np.column_stack([columns["x"], columns["y"], columns["z"], turns])
+        found.append(Estimate(poses=Stream.of(telemetry.source, called, time_s, poses)))
+    if not found:
+        why = f"{', '.join(refused)} may have fused GNSS" if refused else f"neither {ODOMETRY} nor {VISION} was sent"
+        raise telemetry.source.fault(
+            f"no odometry: {why}, and telemetry does not say when the autopilot did: take its own log"
+        )
+    return found
 
 
 def _booted(messages: Mapping[str, Columns]) -> tuple[Floats, Floats]:
@@ -237,17 +312,16 @@ def _booted(messages: Mapping[str, Columns]) -> tuple[Floats, Floats]:
     return received[order], boot[order]
 
 
-def _gps_seconds(messages: Mapping[str, Columns]) -> Floats:
-    """Return the times of the fixes on the autopilot's own clock, which they count by, or from 1970."""
-    gps = messages[GPS_RAW]
-    own_s, received = gps["time_usec"] / 1e6, gps["received"]
+def _on_boot(messages: Mapping[str, Columns], own_s: Floats, received: Floats, *, is_own: bool = True) -> Floats:
+    """Return times on the autopilot's own clock, which messages count by, or from 1970, or by a clock of their own."""
     others, boot_s = _booted(messages)
     if not len(others):
         return own_s if (own_s > 0).all() else received
     arrived_s = np.interp(received, others, boot_s)
     if not (own_s > 0).all():
         return arrived_s
-    return own_s - float(np.median(own_s - arrived_s)) if (own_s > _EPOCH_S).all() else own_s
+    is_other = not is_own or (own_s > _EPOCH_S).all()
+    return own_s - float(np.median(own_s - arrived_s)) if is_other else own_s
 
 
 def _utc(messages: Mapping[str, Columns]) -> Clock | None:

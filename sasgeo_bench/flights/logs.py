@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flights out of files: GPX, KML, tables with latitude and longitude, TUM; brought onto a region and cut to it."""
+"""Flights out of files: GPX, KML, tables, TUM, logs of autopilots; brought onto a region and cut to it."""
 
 import hashlib
 import json
@@ -64,7 +64,8 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
     """Read a log by its suffix (GPX, KML, SRT, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
 
     `facts` say what a table does not; what they say of a file without it is refused. A line drawn in KML has no times:
-    `read_flight` flies it at an even speed. A `height_m` replaces the log's heights.
+    `read_flight` flies it at an even speed. A `height_m` replaces the log's heights. Logs of autopilots are read by
+    their suffixes, too (`SUFFIXES`), and so are folders of bags of ROS 2.
 
     >>> import tempfile
     >>> line = "<coordinates>9.52,47.14,80 9.53,47.15,80</coordinates><altitudeMode>relativeToGround</altitudeMode>"
@@ -90,7 +91,7 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
 
 def read_places(path: Path) -> Floats:
     """Return longitude and latitude of the points of a log, shape (N, 2); what else it holds needs no unit."""
-    is_table = path.suffix.lower() in (".csv", ".pos")
+    is_table = path.suffix.lower() in _TABLES
     facts = LogFacts(time_unit="none", height_unit="none", angle_unit="none") if is_table else None
     log = read_log(path, facts)
     return np.column_stack([log.lon_deg, log.lat_deg])
@@ -249,13 +250,14 @@ class FlownPath:
     least_m: float = SHORTEST_FLOWN_M
 
     def __post_init__(self) -> None:
-        if not self.file.is_file():
+        if not self.file.is_file() and not is_bag(self.file):
             raise FlightError(f"there is no flight log {self.file}: check the path")
 
     @cached_property
     def key(self) -> str:
         """Return the hash of all that the path follows from."""
-        files = [sha256_of(self.file), None if self.facts.dem is None else sha256_of(self.facts.dem)]
+        logs = sorted(self.file.iterdir()) if self.file.is_dir() else [self.file]
+        files = [*map(sha256_of, logs), None if self.facts.dem is None else sha256_of(self.facts.dem)]
         asked = [*files, self.file.name, asdict(self.facts) | {"dem": None}, self.height_m, self.least_m]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 

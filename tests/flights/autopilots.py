@@ -2,7 +2,7 @@
 """Logs of autopilots as tests write them: one flight, in every format, with what each format has besides."""
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -139,8 +139,8 @@ def write(path: Path, data: bytes) -> Path:
 
 # DataFlash
 
-_DATAFLASH = {"L": "i", "e": "i", "c": "h", "C": "H", "n": "4s", "N": "16s"}
-_PARTS = {"L": 1e7, "e": 100, "c": 100, "C": 100}
+_DATAFLASH = {"L": "i", "e": "i", "E": "I", "c": "h", "C": "H", "n": "4s", "N": "16s"}
+_PARTS = {"L": 1e7, "e": 100, "E": 100, "c": 100, "C": 100}
 # Message -> number, format and columns, as ArduPilot 4.5 declares them (GPS without its last columns).
 MESSAGES = {
     "GPS": (200, "QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
@@ -265,7 +265,7 @@ MORE_TYPES = {
 Message = tuple[str, str, int, Mapping[str, object]]  # topic, type, nanoseconds of the recorder, fields
 
 
-def bag(path: Path, messages: Sequence[Message], *, topics: Sequence[tuple[str, str]] = ()) -> Path:
+def bag(path: Path, messages: Iterable[Message], *, topics: Sequence[tuple[str, str]] = ()) -> Path:
     """A bag of ROS 1 (.bag), or of ROS 2 as a folder of MCAP (.mcap) or of SQLite (.db3); returns what is read."""
     from rosbags import rosbag1, rosbag2  # noqa: PLC0415 - only where it is installed
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: PLC0415
@@ -279,9 +279,10 @@ def bag(path: Path, messages: Sequence[Message], *, topics: Sequence[tuple[str, 
     writer = rosbag1.Writer(path) if is_first else rosbag2.Writer(folder, version=9, storage_plugin=plugin)
     serialize = store.serialize_ros1 if is_first else store.serialize_cdr
     with writer:
-        kinds = dict.fromkeys([*topics, *((topic, kind) for topic, kind, _, _ in messages)])
-        open_ones = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds}
+        open_ones = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in topics}
         for topic, kind, stamp_ns, fields in messages:
+            if topic not in open_ones:
+                open_ones[topic] = writer.add_connection(topic, kind, typestore=store)
             writer.write(open_ones[topic], stamp_ns, serialize(_message_of(store, kind, fields), kind))
     return path if is_first else folder
 

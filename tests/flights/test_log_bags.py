@@ -19,7 +19,7 @@ from tests.flights.autopilots import (
     stamp,
     write,
 )
-from tests.flights.test_log_ulog import check_flown
+from tests.flights.test_log_ulog import check_flown, matrix_of, quaternion_of
 
 rosbags = pytest.importorskip("rosbags", reason="needs the extra [logs]")
 
@@ -47,6 +47,19 @@ def test_a_bag_of_mavros_is_the_flight_by_the_stamps_of_its_headers(tmp_path: Pa
         "not read: /mavros/global_position/global",
         "times: stamps of headers",
     )
+
+
+def test_attitudes_of_ros_are_turned_from_its_axes(tmp_path: Path) -> None:
+    # forward, left, up to east, north, up (REP 103), where ours are forward, right, down to north, east, down
+    to_enu, to_flu = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
+    w, x, y, z = quaternion_of(to_enu @ matrix_of(30, 10, -20) @ to_flu)
+    messages = [
+        (*row[:3], row[3] | {"orientation": {"w": w, "x": x, "y": y, "z": z}}) if row[0] == "/mavros/imu/data" else row
+        for row in mavros_messages(FLOWN)
+    ]
+    log = read_log(bag(tmp_path / "a.bag", messages))
+    for angles_deg, expected in ((log.yaw_deg, 30), (log.pitch_deg, 10), (log.roll_deg, -20)):
+        assert angles_deg == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize("is_new", [True, False], ids=["1.14", "1.13"])

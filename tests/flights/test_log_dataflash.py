@@ -49,7 +49,7 @@ def test_a_log_of_ardupilot_is_the_flight_by_its_first_receiver_with_fixes(tmp_p
         "altitude: above the geoid (the sea)",
         "height: POS.RelHomeAlt, above take-off",
         "attitude: ATT, yaw from true north",
-        "clock: UTC by weeks of GPS 0 less 18 leap seconds",
+        "clock: UTC by weeks of GPS 1 less 18 leap seconds",
     )
 
 
@@ -70,6 +70,43 @@ def test_a_receiver_has_no_utc_before_it_knows_its_week(tmp_path: Path) -> None:
     assert read_log(write(tmp_path / "b.bin", dataflash(rows))).start_s is None
 
 
+def test_utc_is_that_of_the_receiver_that_is_read(tmp_path: Path) -> None:
+    # the first one, which pymavlink dates the log by, counts weeks by 10 bits
+    rows = ardupilot_rows(FLOWN)
+    rows["GPS"] = [(*row[:4], row[4] % 1024 if row[1] == 0 else row[4], *row[5:]) for row in rows["GPS"]]
+    log = read_log(write(tmp_path / "a.bin", dataflash(rows)))
+    assert log.start_s == pytest.approx(START_S, abs=2e-3)
+
+
+def test_a_log_of_before_2015_counts_its_own_milliseconds_beside_those_of_the_week(tmp_path: Path) -> None:
+    messages = {
+        "GPS": (200, "BIHBcLLeeEefI", "Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T"),
+        "ATT": (203, "IccccCC", "TimeMS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
+    }
+    rows = ardupilot_rows(FLOWN)
+    old = {
+        "GPS": [
+            (3, row[3], row[4], 9, 0.8, row[7], row[8], 0.0, row[9], 8.0, 45.0, 0.0, row[0] // 1000)
+            for row in rows["GPS"]
+            if row[1]
+        ],
+        "ATT": [(row[0] // 1000, *row[1:7]) for row in rows["ATT"]],
+    }
+    log = read_log(write(tmp_path / "a.bin", dataflash(old, messages)))
+    assert log.lat_deg == pytest.approx(FLOWN.lat_deg, abs=1e-9)
+    assert log.time_s == pytest.approx(FLOWN.time_s, abs=1e-3)
+    assert log.start_s == pytest.approx(START_S, abs=2e-3)
+    assert (log.yaw_deg - FLOWN.yaw_deg + 180) % 360 - 180 == pytest.approx(0, abs=0.02)
+
+
+def test_angles_of_attitude_keep_their_order(tmp_path: Path) -> None:
+    rows = ardupilot_rows(FLOWN)
+    rows["ATT"] = [(row[0], 0.0, -20.0, 0.0, 10.0, 0.0, 30.0, 0.0, 0.0, 1) for row in rows["ATT"]]
+    log = read_log(write(tmp_path / "a.bin", dataflash(rows)))
+    for angles_deg, expected in ((log.yaw_deg, 30), (log.pitch_deg, 10), (log.roll_deg, -20)):
+        assert angles_deg == pytest.approx(expected)
+
+
 def test_a_log_without_fixes_heights_or_attitudes_says_so(tmp_path: Path) -> None:
     rows = ardupilot_rows(FLOWN)
     log = read_log(write(tmp_path / "a.bin", dataflash({"GPS": rows["GPS"]})))
@@ -81,7 +118,7 @@ def test_a_log_without_fixes_heights_or_attitudes_says_so(tmp_path: Path) -> Non
         read_log(write(tmp_path / "c.bin", dataflash({"ATT": rows["ATT"]})))
 
 
-@pytest.mark.filterwarnings("ignore:a.bin. left out 1 point without a value of ATT")  # the last, before its attitude
+@pytest.mark.filterwarnings("ignore:a.bin. left out 1 point without a value of")  # the last, before its attitude
 @pytest.mark.parametrize("part", [0.5, 0.61, 0.73])
 def test_a_log_that_was_cut_off_is_read_up_to_the_cut(tmp_path: Path, part: float) -> None:
     whole = dataflash(ardupilot_rows(FLOWN))
@@ -93,7 +130,7 @@ def test_a_log_that_was_cut_off_is_read_up_to_the_cut(tmp_path: Path, part: floa
 
 def test_a_log_that_ends_in_the_rest_of_a_page_is_whole(tmp_path: Path) -> None:
     log = read_log(write(tmp_path / "a.bin", dataflash(ardupilot_rows(FLOWN)) + bytes(100)))
-    assert (len(log), log.notes[-1]) == (200, "clock: UTC by weeks of GPS 0 less 18 leap seconds")
+    assert (len(log), log.notes[-1]) == (200, "clock: UTC by weeks of GPS 1 less 18 leap seconds")
 
 
 def test_bytes_between_messages_are_passed_over_and_counted(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:

@@ -26,6 +26,7 @@ from tests.flights.autopilots import (
     north_east_m,
     px4_drift,
     stamps_us,
+    tlog,
     turn,
     ulog,
     write,
@@ -115,10 +116,11 @@ def test_a_global_estimate_is_no_truth(tmp_path: Path) -> None:
 def _visual(scale: float, turned_deg: float, drift_deg_per_s: float) -> list[tuple]:
     """Poses of a camera whose frame is turned, and turns on."""
     rows = []
+    place_m = north_east_m() * scale
     for at, us in enumerate(stamps_us(FLOWN.time_s)):
         off_deg = turned_deg + drift_deg_per_s * FLOWN.time_s[at]
         c, s = np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))
-        north, east = north_east_m()[at] * scale
+        north, east = place_m[at]
         place = (c * north - s * east, s * north + c * east, -float(FLOWN.height_m[at]))
         rows.append((us, 2, *place, *turn(float(FLOWN.yaw_deg[at]) + off_deg)))
     return rows
@@ -248,8 +250,9 @@ def test_a_receivers_velocity_that_is_fused_beside_another_position_is_refused(t
 def test_poses_of_a_camera_of_ardupilot_are_odometry(tmp_path: Path) -> None:
     rows = ardupilot(1.0, lambda _: True)
     rows["VISP"] = []
+    place_m = north_east_m() * 1.04
     for at, us in enumerate(stamps_us(FLOWN.time_s)):
-        north, east = (north_east_m()[at] * 1.04).tolist()
+        north, east = place_m[at].tolist()
         yaw = float(FLOWN.yaw_deg[at])
         rows["VISP"].append((us, us, us // 1000, north, east, 0.0, 0.0, 0.0, yaw, 0.1, 0.1, 0.1, 0, 90))
     logged = read_runs(write(tmp_path / "a.bin", dataflash(rows)))
@@ -262,8 +265,9 @@ def test_steps_of_a_camera_are_summed_in_the_axes_of_the_body(tmp_path: Path) ->
     rows = ardupilot(1.0, lambda _: True)
     rows["VISO"] = []
     yaw_rad = np.unwrap(np.radians(FLOWN.yaw_deg))
+    place_m = north_east_m() * 1.02
     for at, us in enumerate(stamps_us(FLOWN.time_s)):
-        north, east = (north_east_m()[at] - north_east_m()[max(at - 1, 0)]) * 1.02
+        north, east = place_m[at] - place_m[max(at - 1, 0)]
         before = yaw_rad[max(at - 1, 0)]
         ahead = np.cos(before) * north + np.sin(before) * east
         right = -np.sin(before) * north + np.cos(before) * east
@@ -271,6 +275,64 @@ def test_steps_of_a_camera_are_summed_in_the_axes_of_the_body(tmp_path: Path) ->
     logged = read_runs(write(tmp_path / "a.bin", dataflash(rows, messages)))
     assert figure(logged, "position_pct") == pytest.approx(2, abs=0.02)
     assert figure(logged, "yaw_deg") == pytest.approx(0, abs=0.02)
+
+
+# Telemetry
+
+
+def _with_odometry(*, scale: float = 1.03, estimator_type: int = 3, system: int = 1, is_old: bool = False) -> bytes:
+    """Telemetry of a flight with poses that a companion sent, counted by its own clock, in a frame that is turned."""
+    from pymavlink.dialects.v20 import common  # type: ignore[import-untyped] # noqa: PLC0415 - only where installed
+
+    link = common.MAVLink(None, srcSystem=system, srcComponent=197)
+    packets = tlog(FLOWN, systems=(1, 2) if system == 2 else (1,), late_s=0)
+    nan = [float("nan")] * 21
+    place_m = north_east_m() * scale
+    turned = np.radians(40.0)
+    for at, time_s in enumerate(FLOWN.time_s.tolist()):
+        north, east = place_m[at].tolist()
+        x, y = np.cos(turned) * north - np.sin(turned) * east, np.sin(turned) * north + np.cos(turned) * east
+        own_us = 5_000_000_000 + round(time_s * 1e6)
+        yaw_deg = float(FLOWN.yaw_deg[at]) + 40.0
+        if is_old:
+            yaw = float(np.radians((yaw_deg + 180) % 360 - 180))
+            one = common.MAVLink_vision_position_estimate_message(own_us, x, y, -80.0, 0.0, 0.0, yaw)
+        else:
+            one = common.MAVLink_odometry_message(
+                own_us, 20, 12, x, y, -80.0, list(turn(yaw_deg)), *[0.0] * 6, nan, nan, 0, estimator_type, 0
+            )
+        received = START_S * 1_000_000 + round(time_s * 1e6)
+        packets += received.to_bytes(8, "big") + bytes(one.pack(link))
+    return packets
+
+
+@pytest.mark.parametrize("is_old", [False, True], ids=["ODOMETRY", "VISION_POSITION_ESTIMATE"])
+def test_poses_that_a_companion_sent_are_odometry(tmp_path: Path, *, is_old: bool) -> None:
+    logged = read_runs(write(tmp_path / "a.tlog", _with_odometry(is_old=is_old)))
+    assert figure(logged, "position_pct") == pytest.approx(3, abs=0.02)
+    assert figure(logged, "yaw_deg") == pytest.approx(0, abs=0.02)
+    assert " of component 197, 1 stretch of " in logged.notes[1]
+
+
+@pytest.mark.parametrize("estimator_type", [0, 4, 5, 8])  # unknown, GPS, with inertial sensors, the autopilot's own
+def test_odometry_that_may_have_fused_gnss_is_refused_by_its_kind(tmp_path: Path, estimator_type: int) -> None:
+    path = write(tmp_path / "a.tlog", _with_odometry(estimator_type=estimator_type))
+    match = rf"no odometry: ODOMETRY of component 197 \(estimator_type {estimator_type}\) may have fused GNSS"
+    with pytest.raises(FlightError, match=match):
+        read_runs(path)
+    with pytest.raises(FlightError, match="no odometry: neither ODOMETRY nor VISION_POSITION_ESTIMATE was sent"):
+        read_runs(write(tmp_path / "b.tlog", tlog(FLOWN)))
+
+
+def test_of_several_vehicles_the_odometry_of_one_is_measured(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.tlog", _with_odometry(system=2))
+    with pytest.raises(FlightError, match="vehicles 1, 2 send places: say which one"):
+        read_runs(path)
+    assert figure(read_runs(path, vehicle=2), "position_pct") == pytest.approx(3, abs=0.02)
+    with pytest.raises(FlightError, match="neither ODOMETRY nor VISION_POSITION_ESTIMATE was sent"):
+        read_runs(path, vehicle=1)
+    with pytest.raises(FlightError, match=r"a\.ulg is no telemetry log: leave out --vehicle"):
+        read_runs(tmp_path / "a.ulg", vehicle=1)
 
 
 # Flags
@@ -296,7 +358,7 @@ def test_a_slow_instance_that_fused_is_not_passed_over_between_its_flags() -> No
     assert free_stretches([slow, often]) == ()
 
 
-@pytest.mark.parametrize("name", ["a.gpx", "a.tlog", "a.csv", "a"])
+@pytest.mark.parametrize("name", ["a.gpx", "a.csv", "a"])
 def test_a_file_that_has_no_odometry_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(FlightError, match=r"is no log with odometry that is read: .ulg, .bin, .log are, and bags of P"):
+    with pytest.raises(FlightError, match=r"is no log with odometry that is read: .ulg, .bin, .log, .tlog are, and ba"):
         read_runs(tmp_path / name)

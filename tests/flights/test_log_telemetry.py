@@ -136,7 +136,7 @@ def test_bytes_that_changed_are_read_or_refused(tmp_path: Path, seed: int, part:
         read_log(write(tmp_path / "a.tlog", bytes(data[: round(len(data) * part)])))
 
 
-@pytest.mark.parametrize("name", sorted(FIELDS))
+@pytest.mark.parametrize("name", ["ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT", "SYSTEM_TIME"])
 def test_each_column_is_what_mavlogdump_of_the_library_prints(tmp_path: Path, name: str) -> None:
     path = write(tmp_path / "a.tlog", tlog(FLOWN))
     tool = Path(sys.executable).parent / "mavlogdump.py"

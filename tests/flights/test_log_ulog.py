@@ -93,6 +93,32 @@ def test_an_estimate_is_a_place_only_where_no_receiver_is_logged_and_is_named(tm
     assert read_log(write(tmp_path / "b.ulg", ulog(topics))).notes[0].startswith("place: vehicle_global_position 0")
 
 
+def matrix_of(yaw_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
+    """Body (forward, right, down) to north, east, down: about down, then the new right, then the new front."""
+    (a, b, c), (d, e, f) = (func(np.radians([yaw_deg, pitch_deg, roll_deg])) for func in (np.cos, np.sin))
+    yaw = np.array([[a, -d, 0], [d, a, 0], [0, 0, 1]])
+    pitch = np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
+    roll = np.array([[1, 0, 0], [0, c, -f], [0, f, c]])
+    return yaw @ pitch @ roll
+
+
+def quaternion_of(matrix: np.ndarray) -> tuple[float, ...]:
+    """w, x, y, z of a rotation that turns by less than half a turn."""
+    w = np.sqrt(1 + np.trace(matrix)) / 2
+    parts = matrix[[2, 0, 1], [1, 2, 0]] - matrix[[1, 2, 0], [2, 0, 1]]
+    return float(w), *(parts / (4 * w)).tolist()
+
+
+def test_attitudes_are_read_through_three_different_angles(tmp_path: Path) -> None:
+    topics = px4_topics(FLOWN)
+    fields, rows = topics["vehicle_attitude", 0]
+    turned = quaternion_of(matrix_of(30, 10, -20))
+    topics["vehicle_attitude", 0] = (fields, [(row[0], *turned) for row in rows])
+    log = read_log(write(tmp_path / "a.ulg", ulog(topics)))
+    for angles_deg, expected in ((log.yaw_deg, 30), (log.pitch_deg, 10), (log.roll_deg, -20)):
+        assert angles_deg == pytest.approx(expected, abs=1e-4)
+
+
 def test_a_home_that_is_set_again_is_what_heights_count_from(tmp_path: Path) -> None:
     topics = px4_topics(FLOWN)
     fields, rows = topics["home_position", 0]

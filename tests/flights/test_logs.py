@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyproj
@@ -20,7 +21,7 @@ from hypothesis import strategies as st
 from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights import log_points
 from sasgeo_bench.flights.log_units import LogFacts
-from sasgeo_bench.flights.logs import read_flight, read_log
+from sasgeo_bench.flights.logs import FlownPath, read_flight, read_log
 from sasgeo_bench.flights.plans import flight_area
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
@@ -28,6 +29,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sensing.camera import Attitude
 from sasgeo_bench.sensing.ground import Dem
+from tests.flights.autopilots import Flown, bag, mavros_messages, px4_topics, ulog
 from tests.sensing.test_ground import write_dem
 
 LON, LAT = 9.52, 47.14
@@ -244,7 +246,7 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(wri
         ("a.gpx", EXTERNAL.format(f"<gpx>{POINT.format(1, 2, '<time>&e;</time>')}</gpx>"), "has a document type or"),
         ("a.kml", EXTERNAL.format(LINE.format("&e;")), "has a document type or entities"),
         ("a.gpx", "<gpx><trk>", "no sound XML"),
-        ("a.gpx", "<gpx>" + "<a>" * 9000, "more than 3000000 elements, or 64 in each other: keep the track alone"),
+        ("a.gpx", "<gpx>" + "<a>" * 9000, "more than 10000000 elements, or 64 in each other: keep the track alone"),
         ("a.gpx", _gpx(_points()).replace("<time>", "<time/><time>"), "point 1: time is no date and time"),
         ("a.gpx", "<gpx/>", "two points at least, the log has 0"),
         ("a.gpx", _gpx(_points()).replace("</trk>", "</trk><trk></trk>"), "more than one track"),
@@ -407,6 +409,32 @@ def test_heights_come_from_the_log_or_are_given(written: Callable, region: Regio
     without = written("b.csv", _table(region, _across(region), more=",alt", cells=",470"))
     with pytest.raises(FlightError, match=r"b\.csv has no height above the ground: say one, as in --height 100"):
         read_flight(without, region)
+
+
+def test_the_log_of_an_autopilot_is_flown_over_a_region(region: Region, tmp_path: Path) -> None:
+    pytest.importorskip("pyulog", reason="needs the extra [logs]")
+    places = _across(region)
+    lon, lat = _lonlat(region, places).T
+    time_s = np.arange(len(places)) * 0.5
+    flown = SimpleNamespace(
+        time_s=time_s, lon_deg=lon, lat_deg=lat, height_m=np.full(len(lon), 90.0), yaw_deg=np.full(len(lon), 30.0)
+    )
+    path = tmp_path / "a.ulg"
+    path.write_bytes(ulog(px4_topics(flown)))
+    over = read_flight(path, region)
+    west, south, east, north = region.grid.bounds_m
+    assert over.position_m[0] == pytest.approx([west + 100, (south + north) / 2, 90], abs=2.5)
+    assert over.position_m[-1] == pytest.approx([east - 100, (south + north) / 2, 90], abs=2.5)
+    convergence = pyproj.Proj(f"EPSG:{region.manifest.epsg}").get_factors(lon[0], lat[0]).meridian_convergence
+    assert over.yaw_deg == pytest.approx(30 - convergence, abs=0.05)
+
+
+def test_a_bag_is_known_by_all_files_of_its_folder(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="needs the extra [logs]")
+    first, second = (bag(tmp_path / f"{at}.mcap", mavros_messages(Flown(count=9 + at))) for at in range(2))
+    keys = [FlownPath(file=folder).key for folder in (first, second)]
+    assert keys[0] != keys[1]
+    assert FlownPath(file=first).key == keys[0]
 
 
 def test_a_flight_that_never_leaves_the_ground_is_refused(written: Callable, region: Region) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.core.errors import ConfigError
-from sasgeo_bench.flights.leap_seconds import utc_of_week
+from sasgeo_bench.flights.leap_seconds import WEEK_S, utc_of_gps
 from sasgeo_bench.observing import replay as replaying
 from sasgeo_bench.observing.fix_files import NS
 from sasgeo_bench.observing.flight_messages import departures, message_of, origin_of
@@ -63,7 +63,7 @@ def test_a_receivers_time_is_that_of_gps():
     with Listener() as listener:
         replay(request_to(listener.port, kind="gps_input"))
     found = listener.named("GPS_INPUT")
-    seconds = [utc_of_week(one.time_week, one.time_week_ms / 1e3) for one in found]
+    seconds = utc_of_gps(np.array([one.time_week * WEEK_S + one.time_week_ms / 1e3 for one in found]))
     assert seconds == pytest.approx([one.fix.time_ns / NS for one in SENT])
     assert [one.lat for one in found] == [round(one.fix.lat_deg * 1e7) for one in SENT]
     assert [one.yaw for one in found] == [35_000, 36_000, 1_000, 2_000, 3_000, 4_000]
@@ -82,7 +82,7 @@ def test_stamps_of_a_simulator_count_from_the_first_time_it_told():
         replay(request_to(listener.port, clock="simulator", speed=1.0, kind="gps_input"))
     found = listener.named("GPS_INPUT")
     assert [one.time_usec / 1e6 for one in found] == [FIRST_S + at for at in range(6)]
-    seconds = [utc_of_week(one.time_week, one.time_week_ms / 1e3) for one in found]
+    seconds = utc_of_gps(np.array([one.time_week * WEEK_S + one.time_week_ms / 1e3 for one in found]))
     assert seconds == pytest.approx([UNIX_S + at for at in range(6)])
     (answer,) = [one for one in listener.named("TIMESYNC") if one.ts1 == ASKED_NS]
     assert FIRST_S <= answer.tc1 / NS < FIRST_S + 6

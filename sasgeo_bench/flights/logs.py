@@ -201,13 +201,31 @@ def read_flight(
     >>> round(flown.distance_m[-1] / 100), round(np.mean(flown.yaw_deg))
     (8, 88)
     """
-    check_within("--least-m", least_m)
-    check_within("--margin-m", margin_m)
-    if not (math.isfinite(step_s) and step_s > 0):
-        raise FlightError(f"step_s must be positive, got {step_s!r}")
-    log = None if is_tum(path) else read_log(path, facts, height_m=height_m)
+    cut = _Cut(margin_m=margin_m, least_m=least_m, height_m=height_m, facts=facts, step_s=step_s)
+    return _over(None if is_tum(path) else read_log(path, facts, height_m=height_m), path, region, cut)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cut:
+    """How a log is cut to a region, as `read_flight` says."""
+
+    margin_m: float
+    least_m: float
+    height_m: float | None
+    facts: LogFacts | None
+    step_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        check_within("--least-m", self.least_m)
+        check_within("--margin-m", self.margin_m)
+        if not (math.isfinite(self.step_s) and self.step_s > 0):
+            raise FlightError(f"step_s must be positive, got {self.step_s!r}")
+
+
+def _over(log: FlightLog | None, path: Path, region: Region, cut: _Cut) -> Trajectory:
+    facts, step_s = cut.facts, cut.step_s
     if log is None:
-        logged = read_poses(path, facts, height_m=height_m)
+        logged = read_poses(path, facts, height_m=cut.height_m)
     else:
         for line in (*log.notes, *gaps_of(log.time_s)):
             tell(line)
@@ -219,7 +237,7 @@ def read_flight(
         is_known = ~_in_gaps(flown.time_s, logged.time_s)
     if log is not None and log.yaw_deg is None:
         flown = _along_course(flown, step_s)
-    return _longest_inside(flown, is_known, path, region, margin_m, least_m)
+    return _longest_inside(flown, is_known, path, region, cut.margin_m, cut.least_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,11 +261,20 @@ class FlownPath:
         asked = [*files, self.file.name, asdict(self.facts) | {"dem": None}, self.height_m, self.least_m]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 
+    @cached_property
+    def log(self) -> FlightLog | None:
+        """The points of the log; None of a file of poses."""
+        return None if is_tum(self.file) else read_log(self.file, self.facts, height_m=self.height_m)
+
+    @property
+    def start_s(self) -> float | None:
+        """When the log begins, seconds since 1970, UTC; None where it does not tell."""
+        return None if self.log is None else self.log.start_s
+
     def over(self, region: Region, *, margin_m: float) -> Trajectory:
         """Return the longest stretch over a region, as `read_flight` does."""
-        return read_flight(
-            self.file, region, margin_m=margin_m, least_m=self.least_m, height_m=self.height_m, facts=self.facts
-        )
+        cut = _Cut(margin_m=margin_m, least_m=self.least_m, height_m=self.height_m, facts=self.facts)
+        return _over(self.log, self.file, region, cut)
 
 
 def _check_near(log: FlightLog, path: Path, region: Region) -> None:

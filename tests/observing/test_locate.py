@@ -29,7 +29,7 @@ from sasgeo_bench.observing.chances import Chances, answers_for, shipped_answers
 from sasgeo_bench.observing.fixes import COLUMNS, Fix, LocateRequest, verdict
 from sasgeo_bench.observing.locate import answer_key, locate, map_of
 from sasgeo_bench.observing.pictures import Told
-from sasgeo_bench.observing.results import csv_text, geojson_text, gpx_text, kml_text, page_text, tum_text
+from sasgeo_bench.observing.results import csv_text, page_text, write_results
 from sasgeo_bench.regions.packed_map import pack_map
 from sasgeo_bench.sensing.crops import drawn_crops
 from tests.flights.test_log_subtitles import block
@@ -213,7 +213,7 @@ def test_a_line_that_was_cut_off_is_asked_again(located, tmp_path):
     into, _ = located
     text = (into / "answers.jsonl").read_text()
     (tmp_path / "answers.jsonl").write_text(text[: len(text) - 40])
-    kept, whole = locating._kept(tmp_path / "answers.jsonl"), locating._kept(into / "answers.jsonl")
+    kept, whole = locating.read_answers(tmp_path / "answers.jsonl"), locating.read_answers(into / "answers.jsonl")
     assert len(kept) == len(whole) - 1
     assert all(whole[key] == fix for key, fix in kept.items())
 
@@ -353,25 +353,33 @@ FIXES = (
 )
 
 
-def test_tables_hold_all_pictures_and_tracks_the_accepted_ones():
+@pytest.fixture(scope="module")
+def files(located, tmp_path_factory) -> Path:
+    """The files about `FIXES`."""
+    folder = tmp_path_factory.mktemp("files")
+    write_results(replace(located[1], request=replace(located[1].request, into=folder), fixes=FIXES))
+    return folder
+
+
+def test_tables_hold_all_pictures_and_tracks_the_accepted_ones(files):
     rows = list(csv.DictReader(csv_text(FIXES).splitlines()))
     assert [row["file"] for row in rows] == ["<b>&.jpg", "'=1+1.jpg", "c.jpg"]
     assert rows[1]["reason"] == "2 places, alike"
-    places = json.loads(geojson_text(FIXES, "(c) OpenStreetMap contributors, ODbL"))
+    places = json.loads((files / "locate.geojson").read_text())
     assert [one["geometry"]["coordinates"] for one in places["features"]] == [[9.5, 47.1], [9.6, 47.2]]
     assert "OpenStreetMap" in places["attribution"]
-    gpx = ET.fromstring(gpx_text(FIXES, "credit"))  # noqa: S314 - our own text
+    gpx = ET.fromstring((files / "locate.gpx").read_text())  # noqa: S314 - our own text
     space = "{http://www.topografix.com/GPX/1/1}"
     points = gpx.findall(f"{space}wpt")
     assert [(one.get("lat"), one.get("lon"), one.findtext(f"{space}name")) for one in points] == [
         ("47.1000000", "9.5000000", "<b>&.jpg")
     ]
-    kml = ET.fromstring(kml_text(FIXES, "credit"))  # noqa: S314
+    kml = ET.fromstring((files / "locate.kml").read_text())  # noqa: S314
     assert kml.find(".//{http://www.opengis.net/kml/2.2}coordinates").text == "9.5000000,47.1000000"
 
 
-def test_a_trajectory_has_the_heading_as_scipy_reads_it():
-    (head, line) = tum_text(FIXES).splitlines()
+def test_a_trajectory_has_the_heading_as_scipy_reads_it(files):
+    (head, line) = (files / "locate.tum").read_text().splitlines()
     assert head.startswith("#")
     numbers = np.array(line.split(), dtype=float)
     assert numbers[0] == 1714558830.0  # 2024-05-01 10:20:30 UTC

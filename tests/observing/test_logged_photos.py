@@ -50,16 +50,15 @@ def test_a_photo_lies_between_the_points_of_the_log_at_its_own_moment(tmp_path):
         assert pose.height_of == "take-off"
         # 350 degrees and more: past north the short way
         assert pose.attitude.yaw_deg % 360 == pytest.approx((350 + second) % 360)
-        assert pose.tilt_deg == pytest.approx(0, abs=1e-6)
+        assert pose.tilt_deg == pytest.approx(0, abs=1e-4)
         assert pose.time_s == pytest.approx(1746093600 + second)
     assert "12.2 s after the log begins, by UTC of both" in table.notes[0]
 
 
 def test_an_offset_is_the_second_of_the_log_at_the_first_photo_whatever_the_clocks_say(tmp_path):
     log = log_of(tmp_path / "log.csv")
-    found = {
-        name: photo(tmp_path / f"{name}.jpg", f"1999:01:01 00:00:0{at}", offset="") for name, at in (("b", 7), ("a", 2))
-    }
+    late, early = (photo(tmp_path / f"{at}.jpg", f"1999:01:01 00:00:0{at}", offset="") for at in (7, 2))
+    found = {"b": late, "a": early}
     with pytest.raises(FlightError, match=r"2 photos \(b, a\) without the zone of the clock: say --offset"):
         poses_by_log(log, found)
     places = {pose.name: pose.place[1] for pose in poses_by_log(log, found, offset_s=10.0).poses}
@@ -90,7 +89,7 @@ def test_photos_that_the_log_does_not_tell_are_left_out_with_the_reason(tmp_path
 
 def test_the_gimbal_of_a_photo_goes_before_the_body_of_the_drone(tmp_path):
     log = log_of(tmp_path / "log.csv")
-    told = xmp_of(GimbalYawDegree="33", GimbalPitchDegree="-80", GimbalRollDegree="0")
+    told = xmp_of({"GimbalYawDegree": "33", "GimbalPitchDegree": "-80", "GimbalRollDegree": "0"}).encode()
     found = {"a": photo(tmp_path / "a.jpg", "2025:05:01 12:00:05", xmp=told)}
     assert poses_by_log(log, found).poses[0].attitude is None  # the photo's own is kept
 
@@ -99,7 +98,7 @@ def test_a_log_that_does_not_say_utc_needs_an_offset_and_a_table_beside_it_is_re
     log = log_of(tmp_path / "log.csv", clock="{:.3f}")
     log.write_text(log.read_text().replace("time,", "time_s,"))
     found = {"a": photo(tmp_path / "a.jpg", "2025:05:01 12:00:05")}
-    with pytest.raises(FlightError, match="log.csv does not say UTC: say --offset"):
+    with pytest.raises(FlightError, match=r"log\.csv does not say UTC: say --offset"):
         poses_by_log(log, found)
     assert np.isclose(poses_by_log(log, found, offset_s=3.0).poses[0].place[1], LAT + 3 * STEP)
     with pytest.raises(ConfigError, match="give --poses or --track alone"):

@@ -188,7 +188,7 @@ class DriftOptions(Options):
 
     logs: Annotated[
         list[Path] | None,
-        typer.Argument(help="logs: ULog, DataFlash, .tlog, bags of PX4; instead of --truth and --estimate"),
+        typer.Argument(help="logs: ULog, DataFlash, .tlog, bags; instead of --truth and --estimate"),
     ] = None
     truth: Annotated[
         list[Path] | None, typer.Option(help="true trajectory, TUM format, plain or gzipped; may be repeated")
@@ -203,6 +203,7 @@ class DriftOptions(Options):
     lost_s: Annotated[float, typer.Option(min=0, help="seconds without a pose that are a lost stretch")] = LOST_S
     axes: AxesFlag = None
     vehicle: VehicleFlag = None
+    topic: Annotated[str | None, typer.Option(help="topic of a bag with poses that fused no GNSS")] = None
     results: Annotated[Path | None, typer.Option(help="also write the figures into this Parquet file")] = None
     profile: Annotated[Path | None, typer.Option(help="also write a profile that was fitted, a TOML file")] = None
 
@@ -223,8 +224,8 @@ def measure_drift_command(drift: DriftOptions) -> None:
         raise FlightError("say either logs, or --truth and --estimate: drift is measured of one of them")
     lengths = drift.lengths
     _check_outputs(drift.inputs, [path for path in (drift.results, drift.profile) if path is not None])
-    if drift.vehicle is not None and not drift.logs:
-        raise FlightError("TUM files are of one vehicle: leave out --vehicle")
+    if not drift.logs and (drift.vehicle, drift.topic) != (None, None):
+        raise FlightError("TUM files have neither vehicles nor topics: leave out --vehicle and --topic")
     if drift.logs:
         logged = _read_logs(drift)
         runs, has_yaw = (
@@ -256,7 +257,10 @@ def _read_logs(drift: DriftOptions) -> dict[Path, LoggedRuns]:
     """Read the odometry of logs, each once."""
     if drift.axes is not None:
         raise FlightError("logs have axes of their own: leave out --axes")
-    logged = {path: read_runs(path, lost_s=drift.lost_s, vehicle=drift.vehicle) for path in drift.logs or []}
+    logged = {
+        path: read_runs(path, lost_s=drift.lost_s, vehicle=drift.vehicle, topic=drift.topic)
+        for path in drift.logs or []
+    }
     if drift.profile is not None and not all(one.has_yaw for one in logged.values()):
         raise FlightError("a profile needs headings, and the log has none but the vehicle's: leave out --profile")
     return logged

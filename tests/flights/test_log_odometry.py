@@ -106,6 +106,23 @@ def test_an_estimate_that_fused_gnss_is_refused_by_name(tmp_path: Path, flags, m
         read_runs(write(tmp_path / "a.ulg", ulog(px4_drift(1.02, flags, **more))))
 
 
+# https://docs.px4.io/main/en/msg_docs/EstimatorStatus and EstimatorStatusFlags: whatever comes of a receiver, or as one
+@pytest.mark.parametrize("bit", [2, 22, 38, 44])
+def test_each_bit_that_a_receiver_is_fused_by_counts(tmp_path: Path, bit: int) -> None:
+    rows = [(us, autopilots.OTHERS | 1 << bit) for us in stamps_us(np.arange(0, 119.0))]
+    flags = {("estimator_status", 0): ("uint64_t timestamp;uint64_t control_mode_flags;", rows)}
+    with pytest.raises(FlightError, match="vehicle_local_position 0 fused GNSS from start to end"):
+        read_runs(write(tmp_path / "a.ulg", ulog(px4_drift(1.02, flags))))
+
+
+@pytest.mark.parametrize("name", ["cs_gps", "cs_gnss_pos", "cs_gnss_vel", "cs_gps_yaw", "cs_gnss_yaw", "cs_aux_gpos"])
+def test_each_flag_that_a_receiver_is_fused_by_counts(tmp_path: Path, name: str) -> None:
+    rows = [(us, False, True) for us in stamps_us(np.arange(0, 119.0))]
+    flags = {("estimator_status_flags", 0): (f"uint64_t timestamp;bool cs_ev_pos;bool {name};", rows)}
+    with pytest.raises(FlightError, match="vehicle_local_position 0 fused GNSS from start to end"):
+        read_runs(write(tmp_path / "a.ulg", ulog(px4_drift(1.02, flags))))
+
+
 def test_a_global_estimate_is_no_truth(tmp_path: Path) -> None:
     log = px4_drift(1.02, {("estimator_status", 0): fusing(_middle)})
     rows = [(row[0], *row[2:5]) for row in log.pop(("vehicle_gps_position", 0))[1]]

@@ -28,9 +28,6 @@ from sasgeo_bench.flights.logs import SHORTEST_FLOWN_M, FlownPath, gaps_of, is_t
 from sasgeo_bench.flights.plans import MARGIN_M
 from sasgeo_bench.flights.trajectory import Axes, Trajectory, read_tum, write_tum
 from sasgeo_bench.regions.region_files import MANIFEST, read_manifest, read_region
-from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.query import PriorGroup
-from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 AxesFlag = Annotated[
     Axes | None,
@@ -150,6 +147,11 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
             for line in _lines(log, options.speed_mps or SPEED_MPS):
                 options.say(line)
         return ()
+    # Half a second, which who only asks what a log holds need not wait for.
+    from sasgeo_bench.tasks.build import make_tasks  # noqa: PLC0415
+    from sasgeo_bench.tasks.query import PriorGroup  # noqa: PLC0415
+    from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests  # noqa: PLC0415
+
     flown = options.flown
     built = Path(options.region, MANIFEST)
     wanted = TaskRequest(

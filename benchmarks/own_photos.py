@@ -70,7 +70,8 @@ def lens() -> Intrinsics:
 
 def photo_of(region: sgb.Region, camera: Camera) -> np.ndarray | None:
     """Return what a camera over the map sees of the mosaic, (H, W, 3); None where that is not all of a picture."""
-    cols, rows = np.meshgrid(np.arange(SHAPE_PX[0]) + 0.5, np.arange(SHAPE_PX[1]) + 0.5)
+    width, height = camera.intrinsics.width_px, camera.intrinsics.height_px
+    cols, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     ground = camera.unproject(np.stack([cols, rows], axis=-1).reshape(-1, 2), Plane())[:, :2]
     if not np.isfinite(ground).all():
         return None

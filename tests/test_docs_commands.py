@@ -57,6 +57,7 @@ ONLY_PARSED = {
     r"^sasgeo-bench enter ": "minutes of drawing; tests/experiments/test_entering.py enters a small board",
     r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",
     r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/cli/test_cli_runs.py does it",
+    r"^sasgeo-bench replay ": "needs a run over flights; tests/cli/test_cli_replay.py makes one",
     r"^sasgeo-bench import-flight ": "needs a log of the reader's own; tests/cli/test_cli_flights.py reads some",
     r"^sasgeo-bench measure-drift .*\.ulg": "needs a log of the reader's own; tests/cli/test_cli_flights.py has some",
     r"runs/sasgeo_track|my-flight": "needs a flight of the reader's own; tests/running/test_trackers.py flies some",

@@ -55,6 +55,8 @@ class Board:
         Checks of the benchmark itself, and of its suites.
     acceptance, protection : DataFrame
         Figures of rejectors at absent places, and of protection levels; empty where the board has none.
+    requirements : DataFrame
+        Which entries pass or fail the requirements that were stated; empty without any.
     answers : DataFrame
         True place and fix of each query of each ranked matcher, and the class of its failure; empty of stored results.
     """
@@ -68,6 +70,7 @@ class Board:
     falsifiers: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
     acceptance: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
     protection: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
+    requirements: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
     answers: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
 
     @classmethod

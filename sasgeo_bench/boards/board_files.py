@@ -32,14 +32,25 @@ from sasgeo_bench.scoring.flights import SCORE_SCHEMA
 from sasgeo_bench.scoring.frames import Column, Schema
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA
 from sasgeo_bench.scoring.rejection import ACCEPTANCE_SCHEMA
+from sasgeo_bench.scoring.requirements import COMPLIANCE_SCHEMA
 from sasgeo_bench.scoring.rows import LEADERBOARD_SCHEMA
 
 LEADERBOARD: Final = "leaderboard"
 PROTECTION: Final = "protection"
 ACCEPTANCE: Final = "acceptance"
 SCORES: Final = "scores"
+REQUIREMENTS: Final = "requirements"
 ANSWERS: Final = "answers"
-TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION, ANSWERS)  # beside the master
+TABLES: Final = (
+    "contrasts",
+    "falsifiers",
+    "controls",
+    SCORES,
+    ACCEPTANCE,
+    PROTECTION,
+    REQUIREMENTS,
+    ANSWERS,
+)  # not the master
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
 PICTURES: Final = "pictures"
@@ -51,7 +62,7 @@ BOARD_FILES: Final = (
     *(f"{SCORES}.parquet", "contrasts.parquet", "falsifiers.parquet", "controls.parquet", BOARD),
     *("contrasts.md", "controls.md"),
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
-    *(f"{ACCEPTANCE}.parquet", f"{ANSWERS}.parquet"),
+    *(f"{name}.parquet" for name in (ACCEPTANCE, REQUIREMENTS, ANSWERS)),
     *("paper.parquet", "trials.parquet", "paper.md"),
 )
 MEND: Final = "score it again"
@@ -212,6 +223,6 @@ SCHEMAS: Final[Mapping[str, Schema]] = {
     schema.name: schema
     for schema in (
         *(LEADERBOARD_SCHEMA, SCORE_SCHEMA, CONTRAST_SCHEMA, FALSIFIER_SCHEMA, CONTROL_SCHEMA),
-        *(ACCEPTANCE_SCHEMA, PROTECTION_SCHEMA, ANSWER_SCHEMA),
+        *(ACCEPTANCE_SCHEMA, PROTECTION_SCHEMA, COMPLIANCE_SCHEMA, ANSWER_SCHEMA),
     )
 }

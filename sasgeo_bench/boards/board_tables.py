@@ -51,8 +51,10 @@ from sasgeo_bench.scoring.compare import LEAST_PLACES, Finding
 from sasgeo_bench.scoring.contrasts import AREAS
 from sasgeo_bench.scoring.controls import Falsifier, Verdict
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES
-from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.scoring.metric import MeanMetric
+from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, LOCALIZATION, RISKS, WITHIN, primary_of
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, mixture_name
+from sasgeo_bench.scoring.requirements import FAILS, NOT_SHOWN, PASSES, is_latency, own_metrics
 from sasgeo_bench.scoring.rows import ALL_SUITES, base_name, is_unranked
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, MOST_STEPS, STRESS, is_bin, is_step
@@ -73,6 +75,31 @@ _OF_FLIGHTS: Final = (
     "first_fix",
     "longest_without_fix_m",
 )  # beside the first
+_USES: Final[Mapping[str, Mapping[str, str]]] = {  # what an integrator asks, by track, under the names of the field
+    LOCALIZATION: {
+        "within_10m": "R@10 m",
+        "within_5m": "R@5 m",
+        "within_5deg": "R@5 deg",
+        "success_5m": "R@5 m, 5 deg",
+        "position_median": "median error (m)",
+        "position_p95": "R95 (m)",
+        "yaw_median": "median heading error (deg)",
+        "log_scale_median": "median scale error (%)",
+    },
+    SEQUENCE: {
+        "available_30s": "available (30 s)",
+        "continuity_60s": "continuity (60 s)",
+        "fix_age_p95_s": "age of fix, p95 (s)",
+        "fix_age_longest_s": "longest (s)",
+        "fix_age_p95_m": "flown since, p95 (m)",
+        "right_confirmed": "right, confirmed",
+        "false_of_confirmed": "false of confirmed",
+        "first_confirmed": "first confirmed (m)",
+        "nees": "NEES",
+        "nees_in_band": "NEES in band",
+        "inside_95": "in 95 % ellipse",
+    },
+}
 _WHOLE: Final = frozenset({ALL, STRESS})  # no kinds
 MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1280 px holds
 
@@ -81,7 +108,8 @@ MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1
 class Book:
     """Figures of a board that take every answer, by entry and queries; and the names of the pages that show them.
 
-    `controls` are the entries that are never ranked, `metrics` those of other packages by name. `counted` names the
+    `controls` are the entries that are never ranked, `metrics` those of other packages by name, `own` those of limits
+    that were stated. `counted` names the
     kinds and steps of stress that the first figure of a table counts, `lost` the entries without a sound answer, and
     how often; both are empty without scored queries.
     """
@@ -96,6 +124,7 @@ class Book:
     counted: Mapping[Key, str]
     lost: Mapping[Key, str]
     metrics: Mapping[str, MetricRecord] = field(default_factory=dict)
+    own: Mapping[str, MeanMetric] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -105,8 +134,9 @@ class Book:
         scores: pd.DataFrame | None = None,
         *,
         metrics: Sequence[MetricRecord] = (),
+        within: Sequence[str] = (),
     ) -> Self:
-        """Index a leaderboard with its entries, which may be listed, its scored queries and metrics of others."""
+        """Index a leaderboard with its entries, which may be listed, scored queries, metrics of others and limits."""
         entries = {entry.name: entry for entry in listed}
         for row in records_of(board.drop_duplicates("matcher")) if "set_apart" in board else ():
             reason: str | None = None if pd.isna(row["set_apart"]) else row["set_apart"]
@@ -135,6 +165,7 @@ class Book:
             counted={key: _counted(rows) for key, rows in _by_group(scored)},
             lost={key: ", ".join(_lost(rows)) for key, rows in _by_group(scored)},
             metrics={one.name: one for one in metrics},
+            own={one.metric.name: one.metric for one in own_metrics(within)},
         )
 
     def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
@@ -148,13 +179,15 @@ class Book:
     def besides(self, track: str) -> tuple[str, ...]:
         """Return the figures that a table shows beside the primary one, of the same queries."""
         own = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
-        return (*own, *(name for name, one in self.metrics.items() if track in one.tracks))
+        tracks = {name: one.tracks for name, one in self.own.items()}
+        tracks |= {name: tuple(one.tracks) for name, one in self.metrics.items()}
+        return (*own, *(name for name, asked in tracks.items() if track in asked))
 
     def column(self, term: str, *, order: str = "none") -> Column:
         """Return the column of a term, which may be a metric of another package."""
         metric, plain = self.metrics.get(term), column(term, order=order)
         if metric is None:
-            return plain
+            return replace(plain, meaning=self.own[term].meaning) if term in self.own else plain
         unit = "" if metric.unit == "1" else f" ({metric.unit})"
         return replace(plain, name=f"{term}{unit}", meaning=metric.to_text())
 
@@ -363,6 +396,41 @@ def _attainable(book: Book, key: Key) -> str:
         return ""
     parts = "; ".join(f"{part} {number_text(float(row['value']))}" for part, row in lower.items())
     return f"{number_text(float(whole['value']))} of the first figure" + (f" ({parts})" if parts else "")
+
+
+def use_table(book: Book, key: Key) -> Table:
+    """Return what an integrator asks beside the first figure: errors; of flights how often fixes come, and how honest.
+
+    There are no rows on a track without such figures; columns that the board does not have are left out.
+    """
+    suite, track, prior_group = key
+    terms = _USES.get(track, {})
+
+    def _figure(term: str) -> Callable[[str], Cell]:
+        times = 100.0 if term == "log_scale_median" else 1.0  # a logarithm of 0.01 is 1 %
+        return lambda name: figure_cell(_scaled(book.main(key, name, term), times))
+
+    fields = (
+        (word("matcher"), book.short_name),
+        *((column(term, title=title), _figure(term)) for term, title in terms.items()),
+    )
+    table = table_of(
+        file_stem("use", suite, track, prior_group),
+        f"{'Fixes in use' if track == SEQUENCE else 'Errors'}: {suite}, {track}, {prior_words(prior_group)}",
+        sorted(book.matchers[key] if terms else (), key=lambda name: (name in book.controls, name)),
+        fields,
+        tone=lambda name: "control" if name in book.controls else "plain",
+    )
+    return table.without_empty(*terms)
+
+
+def use_tables(book: Book) -> Iterator[Table]:
+    """Yield `use_table` of each suite, track and prior group."""
+    yield from (use_table(book, key) for key in sorted(book.matchers))
+
+
+def _scaled(row: Record | None, times: float) -> Record | None:
+    return row and {**row, **{name: times * float(row[name]) for name in ("value", "lo", "hi")}}
 
 
 def strata_tables(book: Book, key: Key) -> Iterator[Table]:
@@ -811,6 +879,86 @@ def protection_tables(protection: pd.DataFrame) -> Iterator[Table]:
             ],
             notes=[f"Alert limits of {others} m: protection.parquet holds them."] if others else (),
         )
+
+
+_REQUIREMENT_NOTES: Final = (
+    "Passes: the worse end of the 95 % interval meets the requirement. Fails: the better end does not. Else not shown.",
+    "Figures are of the queries that the first figure counts.",
+    "Those of accepted answers are of all queries of the suite, with thresholds that were chosen at other places.",
+)
+_RISK_REACHED: Final = frozenset(f"risk_reached_at_{risk:g}" for risk in RISKS)
+_TONE_OF: Final[Mapping[str, str]] = {PASSES: "passes", FAILS: "fails", NOT_SHOWN: "plain"}
+
+
+def requirement_tables(requirements: pd.DataFrame, book: Book) -> Iterator[Table]:
+    """Yield which entries pass the requirements, a table for each suite, track and prior group.
+
+    A line is an entry, with each of its rejectors where a requirement is about accepted answers; `requirements` are of
+    `requirements.compliance_frame`.
+    """
+    parts = requirements.groupby(["suite", "track", "prior_group"], sort=True) if len(requirements) else ()
+    for at, ((suite, track, prior_group), part) in enumerate(parts):
+        by_name: dict[str, dict[str, dict[str, Record]]] = {}
+        for row in records_of(part):
+            by_name.setdefault(row["matcher"], {}).setdefault(row["rejector"], {})[row["requirement"]] = row
+        asked = list(dict.fromkeys(part["requirement"]))
+        lines: list[tuple[Shown, ...]] = []
+        for name, found in by_name.items():
+            for rejector in [one for one in found if one] or [""]:
+                rows = found.get("", {}) | found.get(rejector, {})
+                verdicts = {row["verdict"] for row in rows.values()}
+                whole = next((one for one in (FAILS, NOT_SHOWN) if one in verdicts), PASSES)
+                cells = (_requirement_cell(rows.get(one)) for one in asked)
+                counts = sorted({int(row["n"]) for row in rows.values()} - {0}) or [0]
+                n = Cell(text="-".join(map(str, counts)), key=float(counts[0]))
+                lines.append(
+                    (book.short_name(name), rejector or "-", Cell(text=whole, tone=_TONE_OF[whole]), *cells, n)
+                )
+        yield grid_of(
+            file_stem("requirements", str(suite), str(track), str(prior_group)),
+            f"Requirements: {suite}, {track}, {prior_words(str(prior_group))}",
+            (
+                word("matcher"),
+                word("rejector"),
+                column("requirement", title="all"),
+                *(column("requirement", title=one) for one in asked),
+                column("n"),
+            ),
+            lines,
+            notes=() if at else _REQUIREMENT_NOTES,
+        ).without_empty("rejector")
+
+
+def _requirement_cell(row: Record | None) -> Cell:
+    """Return a verdict, with the figure, its interval and the share that was accepted where only these count."""
+    if row is None:
+        return Cell(text="-")
+    value, lo, hi, accepted = (float(row[name]) for name in ("figure", "figure_lo", "figure_hi", "accepted"))
+    if accepted == 0:
+        details = ["nothing accepted"]
+    elif math.isnan(value):
+        details = ["no threshold" if row["metric"] in _RISK_REACHED else "not measured"]
+    else:
+        details = [_amount_text(value, lo, hi, unit=str(row["unit"]))]
+        details += ["in time"] if is_latency(str(row["metric"])) else []
+        details += [] if math.isnan(accepted) else [f"of {100 * accepted:.3g} % accepted"]
+    verdict = str(row["verdict"])
+    return Cell(text=verdict, key=sort_key(value), tone=_TONE_OF[verdict], details=tuple(details))
+
+
+def _amount_text(value: float, lo: float, hi: float, *, unit: str) -> str:
+    """Return a figure with its interval, a share in per cent.
+
+    >>> _amount_text(0.8123, 0.7, 0.9, unit="1"), _amount_text(31.0, math.nan, math.nan, unit="s")
+    ('81.2 % [70.0, 90.0]', '31.0 s')
+    """
+    scale, shown = (100.0, "%") if unit == "1" else (1.0, unit)
+    ends = "" if math.isnan(lo) else f" [{_tenth(scale * lo)}, {_tenth(scale * hi)}]"
+    return f"{_tenth(scale * value)} {shown}{ends}"
+
+
+def _tenth(value: float) -> str:
+    return "inf" if math.isinf(value) else f"{value:.1f}"
 
 
 def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:

@@ -90,6 +90,8 @@ def board_texts(scored: Scored) -> AdditionalFiles:
         leaderboard=board.leaderboard,
         entries=board.about.entries,
         metrics=board.about.metrics,
+        within=board.about.within,
+        requirements=board.requirements,
         findings=board.findings,
         falsifiers=scored.falsifiers,
         verdicts=board.verdicts,

@@ -45,6 +45,7 @@ class PackManifest(Record):
     """
 
     model_config = ConfigDict(extra="forbid")
+    without_empty: ClassVar = frozenset({"within", "require"})
 
     schema_version: Literal[1, 2, 3]
     split: Plain | None
@@ -58,6 +59,8 @@ class PackManifest(Record):
         BeforeValidator(lambda value: None if value == {} else value),
         PlainSerializer(lambda value: {} if value is None else value.model_dump()),
     ]
+    within: list[str] = []  # limits and requirements of whoever scored it
+    require: list[str] = []
     contestants: list[str]
     dropped: str
     files: dict[str, Sha256] | None = None  # of the first version there are none
@@ -230,7 +233,7 @@ class BoardManifest(Record):
     """
 
     without_empty: ClassVar = frozenset(
-        {"title", "private_seed", "private", "sealed", "metrics", "elsewhere", "failed"}
+        {"title", "private_seed", "private", "sealed", "metrics", "within", "require", "elsewhere", "failed"}
     )
 
     scorer_version: int
@@ -253,6 +256,8 @@ class BoardManifest(Record):
     without: list[str] = []
     rejectors: list[RejectorRecord] = []
     metrics: list[MetricRecord] = []
+    within: list[str] = []  # limits and requirements, as they were stated
+    require: list[str] = []
     remarks: list[str] = []
     elsewhere: list[Elsewhere] = []
     failed: dict[str, str] = {}

@@ -60,9 +60,11 @@ from sasgeo_bench.scoring.entries import (
     scored_rows,
     set_apart,
 )
+from sasgeo_bench.scoring.metric import MeanMetric
 from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metrics, with_metrics
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA, protection_frame
 from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, Rule, evaluate_rejectors, rules_of
+from sasgeo_bench.scoring.requirements import compliance_frame, own_metrics, parse_requirements, with_own
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, base_name, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION, single_views
 from sasgeo_bench.scoring.tables import cost_figures, leaderboards
@@ -80,10 +82,13 @@ def score_board(request: ScoreRequest) -> Scored:
 
     Raise StoreError if predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named
     by itself answers none of the queries. Raise ConfigError if there is nothing to score, or rejectors are named
-    without a split, MatchError or MetricError if a metric of another package cannot be found, or fails.
+    without a split, or a limit or a requirement is none, MatchError or MetricError if a metric of another package
+    cannot be found, or fails.
     """
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules, metrics = rules_of(request.rejectors, request.split), find_metrics(request.metrics)
+    requirements = parse_requirements(request.require)
+    own = own_metrics(request.within, requirements, others={item.metric.name for item in metrics})
     failures = Failures(log_beside(request.board), is_reported=False)  # reported with the board, or raised
     ranks = None
     # Entries are compared together: those that this fails for are noted as failed, and not loaded again.
@@ -96,14 +101,20 @@ def score_board(request: ScoreRequest) -> Scored:
         excluded = set_apart(entries, scores, request.split, controls)
         tasks = tuple(task.manifest for task in loaded.tasks)
         on_private = score_private(request, entries=entries, scores=scores, tasks=tasks)
-        ranks = _ranks(scores, excluded, request.draws, metrics, failures)
+        views = _views_of(loaded.views, scores)
+        frames, more = with_metrics(metrics, scores)
+        asked = (*more, *(one.metric for one in own))
+        ranks = _ranks(with_own(own, frames, views), asked, excluded, request.draws, failures)
     predictions = {item.entry.name: item.predictions for item in loaded.answers}
-    views = _views_of(loaded.views, scores)
     costs = _costs(entries, scores, views, loaded.tasks, failures)
     rejection = _rejection(request, rules, entries, with_calibration, predictions, failures)
     falsifiers, findings = _falsifiers_and_findings(request, scores, rejection, failures)
     protection = _protection(with_calibration, scores, predictions, request.split, failures)
     records = [_entry_record(entry, excluded.get(entry.name), on_private, controls) for entry in entries]
+    leaderboard = with_entry_labels(
+        pd.concat([part for part in (*ranks, *costs, *rejection.rows) if len(part)], ignore_index=True),
+        {one.name: EntryLabel(one.version or "", one.hash or "", one.how or "", one.set_apart) for one in records},
+    )
     board = Board(
         folder=request.board,
         about=_manifest_of(
@@ -115,16 +126,14 @@ def score_board(request: ScoreRequest) -> Scored:
             remarks=rejection.remarks,
             failed=failures.found,
         ),
-        leaderboard=with_entry_labels(
-            pd.concat([part for part in (*ranks, *costs, *rejection.rows) if len(part)], ignore_index=True),
-            {one.name: EntryLabel(one.version or "", one.hash or "", one.how or "", one.set_apart) for one in records},
-        ),
+        leaderboard=leaderboard,
         scores=pd.concat([frame.assign(matcher=name) for name, frame in scores.items()], ignore_index=True),
         contrasts=CONTRAST_SCHEMA.frame(findings),
         controls=CONTROL_SCHEMA.frame(controls),
         falsifiers=FALSIFIER_SCHEMA.frame(falsifiers),
         acceptance=rejection.acceptance,
         protection=protection,
+        requirements=compliance_frame(requirements, leaderboard),
     )
     truths = {truth.query_id: truth for task in loaded.tasks for truth in task.truths}
     return Scored(
@@ -160,14 +169,13 @@ def _scored_entries(request: ScoreRequest, failures: Failures) -> ScoredEntries:
 
 
 def _ranks(
-    scores: Mapping[str, pd.DataFrame],
+    frames: Mapping[str, pd.DataFrame],
+    more: Sequence[MeanMetric],
     excluded: Mapping[str, str],
     draws: int,
-    metrics: Sequence[ForeignMetric],
     failures: Failures,
 ) -> list[pd.DataFrame] | None:
     """Return the figures of all entries together; None if one of them fails, which is noted."""
-    frames, more = with_metrics(metrics, scores)
     compare = partial(leaderboards, draws=draws, excluded=excluded, more=more)
     try:
         return compare(frames)
@@ -370,6 +378,8 @@ def _manifest_of(
             RejectorRecord(**{name: getattr(card, name) for name in RejectorRecord.model_fields}) for card in cards
         ],
         metrics=metrics,
+        within=list(request.within),
+        require=list(request.require),
         remarks=list(remarks),
         elsewhere=list(request.elsewhere),
         failed=dict(failed),

@@ -32,7 +32,8 @@ class ScoreRequest:
     suite. `root` holds tasks/ and truth/, `truth` is the folder of the truths where it is another one.
 
     `split` assigns blocks to places, and names those that calibrate; rejectors (names, or module:Class) need it.
-    `metrics` of other packages (names, or module:NAME) get rows and columns beside ours.
+    `metrics` of other packages (names, or module:NAME) get rows and columns beside ours, and so do limits in `within`
+    (as "5m,2deg"); `require` states requirements (`requirements.parse_requirements`).
     `contrasts` are the registered ones. `draws` counts those of the bootstrap; suites in `by_region` are resampled by
     region, not by block; in suites of `by_block` each block is a place. `without` are regions to leave out, with all of
     their maps. `jobs` processes fit rejectors, or workers of the cluster at `dask`.
@@ -54,6 +55,8 @@ class ScoreRequest:
     contrasts: Sequence[Contrast] = ()
     rejectors: Sequence[str] = ()
     metrics: Sequence[str] = ()
+    within: Sequence[str] = ()
+    require: Sequence[str] = ()
     draws: int = DRAWS
     by_region: Collection[str] = ()
     by_block: Collection[str] = ()

@@ -101,6 +101,8 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         protection=board.protection,
         scenes=source.scenes,
         metrics=board.about.metrics,
+        within=board.about.within,
+        requirements=board.requirements,
     )
     site = Site(
         source=source,

@@ -26,6 +26,7 @@ from sasgeo_bench.boards.board_files import (
     FIGURES,
     LEADERBOARD,
     PROTECTION,
+    REQUIREMENTS,
     SCORES,
 )
 from sasgeo_bench.boards.manifests import PackManifest, PicturesManifest, parse_record
@@ -181,6 +182,7 @@ _OFFERED: Final = {  # files for download, with descriptions
     "controls.parquet": "controls of every matcher",
     f"{ACCEPTANCE}.parquet": "risk and coverage by cost, share and kind of absent places",
     f"{PROTECTION}.parquet": "protection levels, counted",
+    f"{REQUIREMENTS}.parquet": "verdict, figure and interval of each requirement",
     "paper.md": "the paper's experiment next to its Table II",
     "paper.parquet": "the same as a table",
     f"{SCORES}.parquet": "a row for each query of each matcher",

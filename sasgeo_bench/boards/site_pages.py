@@ -9,7 +9,7 @@ from typing import Final
 import pandas as pd
 
 from sasgeo_bench.boards.board_figures import FIGURES, OTHERS
-from sasgeo_bench.boards.board_tables import SHOWN_COSTS, Book, rejection_of, strata_tables, suite_table
+from sasgeo_bench.boards.board_tables import SHOWN_COSTS, Book, rejection_of, strata_tables, suite_table, use_table
 from sasgeo_bench.boards.manifests import BoardEntry, Picture
 from sasgeo_bench.boards.site_files import SiteFigure, SiteSource
 from sasgeo_bench.boards.tables import (
@@ -217,7 +217,9 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
         page=page,
         card=suite_card(name),
         tables=tuple(
-            table for key in keys for table in (suite_table(book, key, book.matchers[key]), *strata_tables(book, key))
+            table
+            for key in keys
+            for table in (suite_table(book, key, book.matchers[key]), use_table(book, key), *strata_tables(book, key))
         ),
         figures=tuple(item for item in source.figures if item.file.startswith(starts)),
         pictures=tuple(

@@ -431,6 +431,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
         "hazardous",
         "exceeded",
         "supports",
+        "requirement",
     ),
 }
 _OF_CONTRASTS: Final = {  # metrics of registered contrasts alone

@@ -22,6 +22,7 @@ from sasgeo_bench.boards.board_tables import (
     falsifier_table,
     protection_tables,
     rejection_tables,
+    requirement_tables,
     risk_tables,
     risk_tables_by_suite,
     scene_tables,
@@ -29,6 +30,7 @@ from sasgeo_bench.boards.board_tables import (
     step_tables,
     suite_tables,
     summary,
+    use_tables,
 )
 from sasgeo_bench.boards.manifests import BoardEntry, BoardManifest, MetricRecord
 from sasgeo_bench.boards.tables import DAGGER, MEANINGS, NOTE, RANKS_NOTE, TERMS, Table, text_of
@@ -242,7 +244,7 @@ class Contents:
 
     `scores` are the scored queries, `steps` the steps of stress (`strata.steps_frame`), `ages` their names where they
     are ages of a map (`plots.age_names`), `scenes` success by kind of place (`tables.scene_frame`), `metrics`
-    those of other packages.
+    those of other packages, `within` the limits that were stated, and `requirements` what came of requirements.
     """
 
     leaderboard: pd.DataFrame
@@ -257,11 +259,13 @@ class Contents:
     ages: Mapping[tuple[Any, ...], str] = field(default_factory=dict)
     scenes: pd.DataFrame = field(default_factory=pd.DataFrame)
     metrics: Sequence[MetricRecord] = ()
+    within: Sequence[str] = ()
+    requirements: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     @cached_property
     def book(self) -> Book:
         """Return the figures that take every answer, by entry and queries."""
-        return Book.of(self.leaderboard, self.entries, self.scores, metrics=self.metrics)
+        return Book.of(self.leaderboard, self.entries, self.scores, metrics=self.metrics, within=self.within)
 
 
 class TableKind(NamedTuple):
@@ -276,11 +280,17 @@ TERMINAL: Final = "terminal"
 MARKDOWN: Final = "leaderboard.md"
 LATEX: Final = "leaderboard.tex"
 TABLES: Final = (  # of a whole board, in the order in which any outlet shows them
+    TableKind(
+        "requirements",
+        "terminal leaderboard.md leaderboard.tex index.html",
+        lambda of: requirement_tables(of.requirements, of.book),
+    ),
     TableKind("summary", "terminal index.html", lambda of: summary(of.book)),
     TableKind("seeds", "leaderboard.md leaderboard.tex index.html", lambda of: [seed_table(of.entries)]),
     TableKind("contrasts", "terminal leaderboard.md leaderboard.tex", lambda of: [contrast_table(of.findings)]),
     TableKind("falsifiers", "leaderboard.md", lambda of: [falsifier_table(of.falsifiers)]),
     TableKind("suites", "leaderboard.md leaderboard.tex", lambda of: suite_tables(of.book)),
+    TableKind("use", "leaderboard.md", lambda of: use_tables(of.book)),
     TableKind("kinds", "kinds-of-place.html", lambda of: scene_tables(of.scenes, of.book)),
     TableKind("risk", "terminal rejection.html", lambda of: risk_tables(of.leaderboard)),
     TableKind("risk by suite", "rejection.html", lambda of: risk_tables_by_suite(of.leaderboard)),

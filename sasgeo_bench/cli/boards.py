@@ -70,6 +70,20 @@ Metrics = Annotated[
     list[str] | None,
     typer.Option(help="one more than every board has: a name from list metrics, or module:NAME; may be repeated"),
 ]
+Within = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="one more metric: share within metres, degrees or both, as in 5m,2deg; may be repeated; default: none, or "
+        "those of stored results"
+    ),
+]
+Require = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="requirements that each entry passes or fails, as in '80% within 50 m, p95 latency 400 ms, false <= 1%'; "
+        "may be repeated; default: none, or those of stored results"
+    ),
+]
 Submissions = Annotated[
     list[Path] | None,
     typer.Option(help="a submission, or a folder of them, for stored results; those for their board are scored"),
@@ -105,6 +119,8 @@ class ScoreOptions(Options):
     ] = None
     rejector: Rejectors = None
     metric: Metrics = None
+    within: Within = None
+    require: Require = None
     submissions: Submissions = None
     private: Private = None
     region_files: RegionFolders = None
@@ -161,6 +177,8 @@ def score(options: ScoreOptions) -> Board:
         usual,
         tasks=options.tasks or (),
         metrics=options.metric or (),
+        within=options.within or usual.within,
+        require=options.require or usual.require,
         truth=options.truth,
         draws=options.draws or usual.draws,
         without=options.without or (),
@@ -306,7 +324,8 @@ def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) 
 
 def show_board(board: Board) -> None:
     """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
-    kinds = tables_of(Contents(leaderboard=board.leaderboard, findings=board.findings), TERMINAL)
+    shown = Contents(leaderboard=board.leaderboard, findings=board.findings, requirements=board.requirements)
+    kinds = tables_of(shown, TERMINAL)
     for table in (one for tables in kinds.values() for one in tables if one.rows):
         say(table.title)
         print_table(table_text(table))

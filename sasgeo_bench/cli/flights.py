@@ -28,6 +28,9 @@ from sasgeo_bench.flights.logs import SHORTEST_FLOWN_M, FlownPath, gaps_of, is_t
 from sasgeo_bench.flights.plans import MARGIN_M
 from sasgeo_bench.flights.trajectory import Axes, Trajectory, read_tum, write_tum
 from sasgeo_bench.regions.region_files import MANIFEST, read_manifest, read_region
+from sasgeo_bench.scoring.gnss_check import IN_A_ROW, SHARE, SIGMA_M, Monitor, check_gnss, summary
+from sasgeo_bench.tasks.query import TRUTH_SIGMA, PriorGroup
+from sasgeo_bench.tasks.task_files import Task
 
 AxesFlag = Annotated[
     Axes | None,
@@ -43,7 +46,7 @@ class FlightOptions(Options):
     file: Annotated[
         Path,
         typer.Argument(
-            help="GPX, KML, KMZ, CSV, RTKLIB .pos, ULog, DataFlash, .tlog, bag, MCAP, or TUM in the region's CRS"
+            help="GPX, KML, KMZ, SRT, CSV, RTKLIB .pos, ULog, DataFlash, .tlog, bag, MCAP, or TUM in the region's CRS"
         ),
     ] = field(kw_only=False)
     region: Annotated[
@@ -149,7 +152,6 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
         return ()
     # Half a second, which who only asks what a log holds need not wait for.
     from sasgeo_bench.tasks.build import make_tasks  # noqa: PLC0415
-    from sasgeo_bench.tasks.query import PriorGroup  # noqa: PLC0415
     from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests  # noqa: PLC0415
 
     flown = options.flown
@@ -185,6 +187,64 @@ def import_flight_command(options: FlightOptions) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class GnssOptions(Options):
+    """Flags of `check-gnss`."""
+
+    run: Annotated[Path, typer.Argument(help="folder of a tracker's run on tasks of flights")] = field(kw_only=False)
+    pull_off: Annotated[
+        str, typer.Option(metavar="M/S,M/S,...", help="speeds at which the receiver's place leaves the true one")
+    ] = "0.2,0.5,1,2"
+    sigma: Annotated[float, typer.Option(help="standard deviation of the receiver's places, metres")] = SIGMA_M
+    in_a_row: Annotated[int, typer.Option(help="accepted fixes that must disagree for an alarm")] = IN_A_ROW
+    seed: Annotated[int, typer.Option(min=0, help="of noise and directions")] = 0
+    out: Out = Path("out")
+
+
+def check_gnss_command(options: GnssOptions) -> None:
+    """Say how soon fixes on the map notice that a receiver is led astray, and how often they are wrong about it."""
+    from sasgeo_bench.boards.run_cases import read_run_cases  # noqa: PLC0415 - a second, as above
+
+    monitor = Monitor(sigma_m=options.sigma, in_a_row=options.in_a_row)
+    speeds_mps = _positive(options.pull_off, "--pull-off", "0.5,2", "metres a second")
+    cases = read_run_cases(options.run, out=options.out, split=None)
+    if not cases.flights:
+        raise FlightError(f"{options.run} has no flights: name a run of a tracker on a task of flights")
+    table = Table(
+        *("suite", "region", "flights", "fixes", "false alarms / h", "pull-off, m/s", "noticed", "after s: p50", "p95"),
+        box=None,
+        pad_edge=False,
+    )
+    for (suite, region), found in cases.flights.items():
+        task = Task.open(cases.root / "tasks" / suite / region, cases.root)
+        is_own = task.manifest.strength_unit == TRUTH_SIGMA
+        groups = [views for _, views in found.views.groupby("sequence_id", sort=True)]
+        for speed_mps in speeds_mps:
+            checks = [
+                check_gnss(
+                    views,
+                    cases.predictions,
+                    monitor=monitor,
+                    pull_mps=speed_mps,
+                    draws_noise=not is_own,
+                    seed=options.seed + number,
+                )
+                for number, views in enumerate(groups)
+            ]
+            figures = summary(checks)
+            fixes = sum(one.fixes for one in checks)
+            times_s = (figures["notice_p50_s"], figures["notice_p95_s"])
+            table.add_row(
+                *(suite, region, str(len(groups)), str(fixes), f"{figures['alarms_per_hour']:.2f}", f"{speed_mps:g}"),
+                f"{figures['noticed']:.0%}",
+                *("never" if time == math.inf else f"{time:.0f}" for time in times_s),
+            )
+        whose = "the truths are the receiver's own places" if is_own else f"the receiver is off by {options.sigma:g} m"
+        alarm = f"an alarm is {options.in_a_row} accepted fixes in a row outside of the ellipse of {SHARE:.1%}"
+        tell(f"{suite} on {region}: {whose}; {alarm}")
+    print_table(table)
+
+
+@dataclass(frozen=True, kw_only=True)
 class DriftOptions(Options):
     """Flags of `measure-drift`."""
 
@@ -217,7 +277,7 @@ class DriftOptions(Options):
     @property
     def lengths(self) -> list[float]:
         """Return the lengths of segments, metres; a receiver's noise hides the drift over short ones."""
-        return _read_lengths(self.lengths_m or ("100,500" if self.logs else "10,50"))
+        return _positive(self.lengths_m or ("100,500" if self.logs else "10,50"), "--lengths-m", "10,50", "metres")
 
 
 def measure_drift_command(drift: DriftOptions) -> None:
@@ -289,7 +349,10 @@ def _summary(flown: Trajectory) -> str:
 def _lines(log: FlightLog, speed_mps: float) -> Iterator[str]:
     """Yield what was read of a log."""
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
-    lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
+    lasts = "no times"
+    if log.time_s is not None:
+        lasts_s = float(log.time_s[-1] - log.time_s[0])  # an SRT counts from the video's begin
+        lasts = f"{lasts_s:.1f} s, {way_m / lasts_s:.2f} m/s on average"
     yield f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}"
     if log.start_s is not None:
         yield f"starts at {dt.datetime.fromtimestamp(log.start_s, tz=dt.UTC).isoformat(timespec='milliseconds')}"
@@ -305,15 +368,15 @@ def _lines(log: FlightLog, speed_mps: float) -> Iterator[str]:
         tell("no height above the ground: a flight needs --height")
 
 
-def _read_lengths(text: str) -> list[float]:
-    """Read lengths in metres, separated by commas; each must be positive."""
+def _positive(text: str, option: str, example: str, unit: str) -> list[float]:
+    """Read positive numbers, separated by commas."""
     try:
-        lengths = [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        lengths = []
-    if not lengths or not all(0 < length < math.inf for length in lengths):
-        raise FlightError(f"--lengths-m must be positive metres as in 10,50, got {text!r}")
-    return lengths
+        numbers = []
+    if not numbers or not all(0 < number < math.inf for number in numbers):
+        raise FlightError(f"{option} must be positive {unit} as in {example}, got {text!r}")
+    return numbers
 
 
 def _read_runs(truth: list[Path], estimate: list[Path], lost_s: float, axes: Axes | None) -> list[PairedRun]:

@@ -10,6 +10,7 @@ import typer
 
 from sasgeo_bench.cli.built_regions import built_region
 from sasgeo_bench.cli.console import said_after
+from sasgeo_bench.cli.observing import VideoOptions
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.observing.import_masks import SUITE as MASKS
@@ -21,6 +22,7 @@ from sasgeo_bench.observing.masks import read_legend
 from sasgeo_bench.observing.photo_flights import OdometerName
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights
+from sasgeo_bench.observing.video import is_video
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.task_files import Task
 
@@ -52,12 +54,12 @@ class PosedOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportPhotosOptions(PosedOptions):
+class ImportPhotosOptions(VideoOptions, PosedOptions):
     """Flags of import-photos."""
 
-    pictures: Annotated[Path, typer.Argument(help="folder of photos (JPEG, TIFF, PNG, WebP, GeoTIFF)")] = field(
-        kw_only=False
-    )
+    pictures: Annotated[
+        Path, typer.Argument(help="folder of photos (JPEG, TIFF, PNG, WebP, GeoTIFF), or a video (MP4, MOV)")
+    ] = field(kw_only=False)
     name: Annotated[str, typer.Option(help="suite of the task")] = SUITE
     odometry: Annotated[
         OdometerName,
@@ -85,7 +87,7 @@ def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
 
     `segment` makes evidence of them, then `run` and `score` work as on any task. Positions come from the photos or a
     table (exiftool, CSV, GeoJSON, TUM, COLMAP, OpenDroneMap, Pix4D, Metashape); they are truths, and how far each is
-    off is stored with it.
+    off is stored with it. Frames of a video get the poses of its track.
 
     Returns
     -------
@@ -96,8 +98,10 @@ def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
     ------
     ConfigError
         If an option makes no sense, or no picture can be asked.
+    FlightError
+        If a video has no track, or it does not tell when the video began.
     ImageError
-        If there is no picture.
+        If there is no picture, or a video cannot be decoded.
     PoseError
         If the table cannot be read.
     StoreError
@@ -111,7 +115,13 @@ def import_photos(options: ImportPhotosOptions) -> tuple[Task, ...]:
         ...
     sasgeo_bench.core.errors.ConfigError: heights come from one source: give --height, --dem or --takeoff-height alone
     """
-    tasks = imported_by(replace(_request(options, options.pictures), odometry=options.odometry))
+    request = replace(_request(options, options.pictures), odometry=options.odometry)
+    if options.track is not None and not is_video(options.pictures):
+        options.check_of_video("every", "fov")
+        request = replace(request, log=options.track, offset_s=options.offset)
+    else:
+        request = replace(request, pictures=options.photos_of(options.pictures, options.out))
+    tasks = imported_by(request)
     for task in tasks:
         options.say(task.folder)
     return tasks

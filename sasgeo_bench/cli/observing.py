@@ -5,7 +5,7 @@ import hashlib
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -21,6 +21,7 @@ from sasgeo_bench.observing.fixes import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTE
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results
+from sasgeo_bench.observing.video import EVERY_S, VideoRequest, is_video, video_photos
 from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
@@ -29,12 +30,52 @@ _SIGMA_DEG: Final = 10.0  # of a heading that is given alone
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocateOptions(Options):
-    """Flags of locate."""
+class VideoOptions(Options):
+    """Flags of commands that take a video in place of pictures."""
 
-    pictures: Annotated[Path, typer.Argument(help="a picture, or a folder of them (JPEG, PNG, WebP, GeoTIFF)")] = field(
-        kw_only=False
-    )
+    track: Annotated[
+        Path | None, typer.Option(help="of a video: SRT, or a log that import-flight reads; default: the SRT beside it")
+    ] = None
+    every: Annotated[float | None, typer.Option(help=f"seconds between frames of a video; default: {EVERY_S:g}")] = None
+    fov: Annotated[
+        float | None, typer.Option(help="horizontal field of view of a video, degrees; default: by the SRT")
+    ] = None
+    offset: Annotated[
+        float | None,
+        typer.Option(help="seconds of the track at which a video begins; default: by the motion that both show"),
+    ] = None
+
+    def check_of_video(self, *names: str) -> None:
+        """Raise `ConfigError` if options are given that only a video has."""
+        for name in names:
+            if getattr(self, name) is not None:
+                raise ConfigError(f"--{name} is of a video, and these pictures are none: leave it out")
+
+    def photos_of(self, pictures: Path, out: Path, *, needs_track: bool = True, needs_lens: bool = True) -> Path:
+        """Return the folder of a video's frames, which are written if they are not there; anything else as it is."""
+        if not is_video(pictures):
+            self.check_of_video("track", "every", "fov", "offset")
+            return pictures
+        request = VideoRequest(
+            path=pictures,
+            out=out,
+            track=self.track,
+            every_s=EVERY_S if self.every is None else self.every,
+            fov_deg=self.fov,
+            offset_s=self.offset,
+            needs_track=needs_track,
+            needs_lens=needs_lens,
+        )
+        return video_photos(request)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchOptions(Options):
+    """Flags of locate, but for those of a video."""
+
+    pictures: Annotated[
+        Path, typer.Argument(help="a picture, a folder of them (JPEG, PNG, WebP, GeoTIFF), or a video (MP4, MOV)")
+    ] = field(kw_only=False)
     region: Annotated[
         str | None,
         typer.Option(help="built region, its folder, or a packed map (*.map); default: the newest that fits"),
@@ -57,12 +98,18 @@ class LocateOptions(Options):
     out: Out = Path("out")
 
 
+@dataclass(frozen=True, kw_only=True)
+class LocateOptions(VideoOptions, SearchOptions):
+    """Flags of locate."""
+
+
 @takes(LocateOptions)
 def locate(options: LocateOptions) -> Located:
     """Find out where pictures were taken, and how far to trust it; a page shows what was seen and where it fits.
 
     The position in a file is the middle of nothing: it lies anywhere in the disc that is searched, so that it can be
-    no answer. A second call goes on where the first was cut off.
+    no answer. A second call goes on where the first was cut off. A video is located by frames of it, which get places,
+    heights and angles of its track.
 
     Returns
     -------
@@ -73,8 +120,10 @@ def locate(options: LocateOptions) -> Located:
     ------
     ConfigError
         If an option makes no sense, or no built region holds the place.
+    FlightError
+        If a video has no track, or it does not tell when the video began.
     ImageError
-        If there is no picture. One that cannot be read is a row, no error.
+        If there is no picture, or a video cannot be decoded. A picture that cannot be read is a row, no error.
     MatchError
         If the matcher or the segmenter cannot be loaded.
     StoreError
@@ -110,7 +159,13 @@ def locate(options: LocateOptions) -> Located:
         most_false=options.most_false,
         is_sandboxed=not options.trusted,
     )
-    found = located_by(request, lambda region: Strips(into, region))
+    frames = options.photos_of(
+        options.pictures,
+        options.out,
+        needs_track=request.near is None and request.region is None,
+        needs_lens=options.ground_width is None,
+    )
+    found = located_by(replace(request, pictures=frames), lambda region: Strips(into, region))
     for fix in found.fixes:
         options.say(line_of(fix))
     answered = [found.calibration] if any(fix.p_false is not None for fix in found.fixes) else []

@@ -78,6 +78,8 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Flights": {
         "import-flight": "flights",
         "measure-drift": "flights",
+        "check-gnss": "flights",
+        "replay": "replaying",
     },
     "Datasets of others": {
         "import-dataset": "importing",
@@ -110,6 +112,7 @@ KEPT: Final = {
     "run": "answers so far are kept; the same command asks the other queries",
     "enter": "queries and answers so far are kept; the same command goes on from there",
     "leaderboard": "queries and answers so far are kept; the same command goes on from there",
+    "replay": "fixes so far were sent, and no file is half-written; the same command begins the flight anew",
     "send": "files that were sent are kept; the same command sends the others",
     "fetch": "files that were fetched are kept beside the folder; the same command fetches the others",
 }

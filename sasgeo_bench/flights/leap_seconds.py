@@ -2,6 +2,7 @@
 """Times of GPS in UTC: receivers and logs count without the leap seconds that clocks have."""
 
 import datetime as dt
+from bisect import bisect_right
 from typing import Final
 
 import numpy as np
@@ -36,3 +37,14 @@ def utc_of_gps(gps_s: NDArray[np.float64]) -> NDArray[np.float64]:
     [-16.0, -18.0]
     """
     return np.asarray(GPS_EPOCH_S + gps_s - np.searchsorted(_STARTS, gps_s, side="right"))
+
+
+def week_of_utc(utc_s: float) -> tuple[int, int]:
+    """Return the week of GPS, not wrapped, and the milliseconds in it, of seconds since 1970, UTC.
+
+    >>> week, week_ms = week_of_utc(dt.datetime(2025, 1, 19, 23, 59, 42, 500_000, tzinfo=dt.UTC).timestamp())
+    >>> week, week_ms, utc_of_gps(np.array(week * WEEK_S + week_ms / 1000)).item() - GPS_EPOCH_S - week * WEEK_S
+    (2350, 86400500, 86382.5)
+    """
+    gps_ms = round((utc_s - GPS_EPOCH_S + bisect_right(_LEAPS, utc_s)) * 1000)
+    return divmod(gps_ms, WEEK_S * 1000)

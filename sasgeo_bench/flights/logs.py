@@ -22,6 +22,7 @@ from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
 from sasgeo_bench.flights.log_dataflash import read_dataflash
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
+from sasgeo_bench.flights.log_subtitles import read_srt
 from sasgeo_bench.flights.log_table import read_csv
 from sasgeo_bench.flights.log_telemetry import read_tlog
 from sasgeo_bench.flights.log_ulog import read_ulog
@@ -43,6 +44,7 @@ _READERS: Final = MappingProxyType(
         ".gpx": read_gpx,
         ".kml": read_kml,
         ".kmz": read_kml,
+        ".srt": lambda path: read_srt(path).log,
         ".ulg": read_ulog,
         ".bin": read_dataflash,
         ".log": read_dataflash,
@@ -59,7 +61,7 @@ _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
 def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | None = None) -> FlightLog:
-    """Read a log by its suffix (GPX, KML, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
+    """Read a log by its suffix (GPX, KML, SRT, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
 
     `facts` say what a table does not; what they say of a file without it is refused. A line drawn in KML has no times:
     `read_flight` flies it at an even speed. A `height_m` replaces the log's heights. Logs of autopilots are read by
@@ -150,8 +152,8 @@ def read_flight(
     Parameters
     ----------
     path : Path
-        GPX, KML, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting, northing and height
-        of the region's CRS.
+        GPX, KML, SRT of a DJI, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting,
+        northing and height of the region's CRS.
     region : Region
         The stretch lies over its mapped ground.
     margin_m : float
@@ -200,13 +202,31 @@ def read_flight(
     >>> round(flown.distance_m[-1] / 100), round(np.mean(flown.yaw_deg))
     (8, 88)
     """
-    check_within("--least-m", least_m)
-    check_within("--margin-m", margin_m)
-    if not (math.isfinite(step_s) and step_s > 0):
-        raise FlightError(f"step_s must be positive, got {step_s!r}")
-    log = None if is_tum(path) else read_log(path, facts, height_m=height_m)
+    cut = _Cut(margin_m=margin_m, least_m=least_m, height_m=height_m, facts=facts, step_s=step_s)
+    return _over(None if is_tum(path) else read_log(path, facts, height_m=height_m), path, region, cut)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Cut:
+    """How a log is cut to a region, as `read_flight` says."""
+
+    margin_m: float
+    least_m: float
+    height_m: float | None
+    facts: LogFacts | None
+    step_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        check_within("--least-m", self.least_m)
+        check_within("--margin-m", self.margin_m)
+        if not (math.isfinite(self.step_s) and self.step_s > 0):
+            raise FlightError(f"step_s must be positive, got {self.step_s!r}")
+
+
+def _over(log: FlightLog | None, path: Path, region: Region, cut: _Cut) -> Trajectory:
+    facts, step_s = cut.facts, cut.step_s
     if log is None:
-        logged = read_poses(path, facts, height_m=height_m)
+        logged = read_poses(path, facts, height_m=cut.height_m)
     else:
         for line in (*log.notes, *gaps_of(log.time_s)):
             tell(line)
@@ -218,7 +238,7 @@ def read_flight(
         is_known = ~_in_gaps(flown.time_s, logged.time_s)
     if log is not None and log.yaw_deg is None:
         flown = _along_course(flown, step_s)
-    return _longest_inside(flown, is_known, path, region, margin_m, least_m)
+    return _longest_inside(flown, is_known, path, region, cut.margin_m, cut.least_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,11 +262,20 @@ class FlownPath:
         asked = [*files, self.file.name, asdict(self.facts) | {"dem": None}, self.height_m, self.least_m]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 
+    @cached_property
+    def log(self) -> FlightLog | None:
+        """The points of the log; None of a file of poses."""
+        return None if is_tum(self.file) else read_log(self.file, self.facts, height_m=self.height_m)
+
+    @property
+    def start_s(self) -> float | None:
+        """When the log begins, seconds since 1970, UTC; None where it does not tell."""
+        return None if self.log is None else self.log.start_s
+
     def over(self, region: Region, *, margin_m: float) -> Trajectory:
         """Return the longest stretch over a region, as `read_flight` does."""
-        return read_flight(
-            self.file, region, margin_m=margin_m, least_m=self.least_m, height_m=self.height_m, facts=self.facts
-        )
+        cut = _Cut(margin_m=margin_m, least_m=self.least_m, height_m=self.height_m, facts=self.facts)
+        return _over(self.log, self.file, region, cut)
 
 
 def _check_near(log: FlightLog, path: Path, region: Region) -> None:

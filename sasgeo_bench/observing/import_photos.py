@@ -17,6 +17,7 @@ from sasgeo_bench.core.errors import ConfigError, SasgeoError, counted, named
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import NAME, plain
 from sasgeo_bench.geometry.pose import Prior
+from sasgeo_bench.observing.logged_photos import poses_by_log
 from sasgeo_bench.observing.photo_flights import GAP_S, ODOMETERS, Odometer, OdometerName, flights_of, trajectory_of
 from sasgeo_bench.observing.picture_poses import PoseFacts, PoseTable
 from sasgeo_bench.observing.pictures import Sight, averaged, fitted, list_pictures, names_of, see_whole
@@ -80,6 +81,10 @@ class ImportRequest:
         Suite of the task; that of flights ends in "-flights".
     poses : Path, optional
         Table that replaces what photos say of themselves (`pose_tables.read_pose_table`).
+    log : Path, optional
+        Of the flight, in place of a table (`logged_photos.poses_by_log`).
+    offset_s : float, optional
+        Seconds of the log at the first photo; without it the clocks of both must be known.
     facts : PoseFacts
         What the table leaves open.
     heights : Heights
@@ -104,6 +109,8 @@ class ImportRequest:
     out: Path
     name: str = SUITE
     poses: Path | None = None
+    log: Path | None = None
+    offset_s: float | None = None
     facts: PoseFacts = field(default_factory=PoseFacts)
     heights: Heights = field(default_factory=Heights)
     sigma_m: float | None = None
@@ -119,6 +126,8 @@ class ImportRequest:
             )
         if self.sigma_m is not None and not 0 < self.sigma_m <= 100:
             raise ConfigError(f"--sigma lies above 0 and within 100 m, got {self.sigma_m!r}")
+        if self.log is not None and self.poses is not None:
+            raise ConfigError("poses come from one source: give --poses or --track alone")
         if self.seed < 0:
             raise ConfigError(f"--seed is 0 or more, got {self.seed!r}")
 
@@ -227,6 +236,12 @@ def _posed(request: ImportRequest, epsg: int) -> PosedPictures:
 def table_of(request: ImportRequest) -> PoseTable | None:
     """Read the table of poses of a request, and tell what it holds; None without one."""
     table = None
+    if request.log is not None:
+        paths = list_pictures(request.pictures, is_told=False)
+        photos = dict(zip(names_of(paths, request.pictures), paths, strict=True))
+        table = poses_by_log(request.log, photos, offset_s=request.offset_s)
+        for line in table.lines():
+            tell(line)
     if request.poses is not None:
         facts = request.facts
         if not facts.names and not facts.times_s:  # a TUM file's pictures: those of the folder, in their order
@@ -316,7 +331,8 @@ class TaskWriter:
 
     def _origin(self, suite: str, pictures: Sequence[PosedPicture], more: str) -> TaskOrigin:
         sigmas_m = [one.sigma_m for one in pictures]
-        by = "their files" if self.request.poses is None else self.request.poses.name
+        table = self.request.poses or self.request.log
+        by = "their files" if table is None else table.name
         searched = self.request.group.words.removeprefix("searched: ")
         return TaskOrigin(
             suite=suite,

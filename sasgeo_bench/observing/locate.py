@@ -79,7 +79,7 @@ def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = No
     watch = None if watching is None else watching(region)
     request.into.mkdir(parents=True, exist_ok=True)
     with locked(request.into), _Asker(request, region, manifest) as asker:
-        kept = _kept(request.into / ANSWERS)
+        kept = read_answers(request.into / ANSWERS)
         fixes: list[Fix] = []
         label = "pictures located"
         progress.begin(label, len(paths))
@@ -107,7 +107,7 @@ def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = No
         )
 
 
-def _kept(path: Path) -> dict[str, Fix]:
+def read_answers(path: Path) -> dict[str, Fix]:
     """Return the fixes of earlier calls by key; a last line that was cut off counts as none."""
     if not path.is_file():
         return {}

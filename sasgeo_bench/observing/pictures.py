@@ -33,6 +33,7 @@ from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import AerialImage, decode_image
 from sasgeo_bench.sensing.photos import MOST_BYTES, Photo, read_photo
+from sasgeo_bench.sensing.video import SUFFIXES as VIDEOS
 
 WIDEST_M: Final = 384.0  # side of a view: the largest that was measured
 LEAST_M: Final = 16.0  # of a smaller view nothing can be said
@@ -40,7 +41,7 @@ FINEST_M: Final = 0.25  # pixels on the ground; finer ones are averaged
 STEEPEST_DEG: Final = 60.0  # of tilt: beyond it the ground of a view is far and coarse
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
 _UNREAD: Final = frozenset(  # pictures and videos that drones and telephones write
-    {".dng", ".heic", ".heif", ".raw", ".arw", ".cr2", ".nef", ".bmp", ".gif", ".jxl", ".avif", ".mp4", ".mov", ".avi"}
+    {".dng", ".heic", ".heif", ".raw", ".arw", ".cr2", ".nef", ".bmp", ".gif", ".jxl", ".avif", *VIDEOS}
 )
 _FINE_M: Final = 128.0  # widest view in cells of `_CELLS_M[0]`, as in the suites
 _CELLS_M: Final = (0.5, 1.0)
@@ -181,9 +182,10 @@ def list_pictures(path: Path, *, is_told: bool = True) -> list[Path]:
         other = Counter(one.suffix.lower() for one in files if one.suffix.lower() in _UNREAD)
         if other and is_told:
             kinds = ", ".join(f"{count} {suffix}" for suffix, count in other.most_common())
-            tell(f"passed over in {path}: {kinds}, which are not read: export them as JPEG, frames of a video too")
+            tell(f"passed over in {path}: {kinds}: export photos as JPEG, and name each video by itself")
         if not found:
-            raise ImageError(f"{path} holds no picture ({', '.join(SUFFIXES)}): name a folder that does")
+            videos = ", or one of its videos" if any(suffix in VIDEOS for suffix in other) else ""
+            raise ImageError(f"{path} holds no picture ({', '.join(SUFFIXES)}): name a folder that does{videos}")
         return found
     if not path.is_file():
         raise ImageError(f"there is no picture or folder {path}: check the path")

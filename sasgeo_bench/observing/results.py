@@ -5,14 +5,12 @@ import base64
 import csv
 import datetime as dt
 import html
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Final
-from xml.etree import ElementTree as ET
 
 import cv2
 import numpy as np
@@ -23,6 +21,7 @@ from sasgeo_bench.core.errors import counted
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.texts import csv_cell, plain
 from sasgeo_bench.geometry.projection import to_grid
+from sasgeo_bench.observing.fix_files import PlacedFix, geojson_text, gpx_text, kml_text, tum_text
 from sasgeo_bench.observing.fixes import COLUMNS, Fix, Located, Seen, Watch
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
@@ -143,12 +142,19 @@ def write_results(located: Located) -> list[Path]:
     """
     folder, fixes = located.request.into, located.fixes
     credit = located.manifest.attribution
+    accepted = [one for one in map(placed, fixes) if one is not None and one.is_accepted]
+    properties = [name for name in COLUMNS if name not in ("lon", "lat")]
+    points = [
+        (fix.lon, fix.lat, {name: getattr(fix, name) for name in properties})
+        for fix in fixes
+        if fix.lon is not None and fix.lat is not None
+    ]
     texts = {
         TABLE: csv_text(fixes),
-        "locate.geojson": geojson_text(fixes, credit),
-        "locate.gpx": gpx_text(fixes, credit),
-        "locate.kml": kml_text(fixes, credit),
-        "locate.tum": tum_text(fixes),
+        "locate.geojson": geojson_text(points, credit),
+        "locate.gpx": gpx_text(accepted, credit),
+        "locate.kml": kml_text(accepted, credit),
+        "locate.tum": tum_text(accepted),
         PAGE: page_text(located),
     }
     for name, text in texts.items():
@@ -172,79 +178,37 @@ def csv_text(fixes: Sequence[Fix]) -> str:
     return text.getvalue()
 
 
-def geojson_text(fixes: Sequence[Fix], credit: str) -> str:
-    """Return all places as GeoJSON (RFC 7946), the columns of the table being properties."""
-    features = [
-        {
-            "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [fix.lon, fix.lat]},
-            "properties": {name: getattr(fix, name) for name in COLUMNS if name not in ("lon", "lat")},
-        }
-        for fix in fixes
-        if fix.lon is not None
-    ]
-    return json.dumps({"type": "FeatureCollection", "attribution": credit, "features": features}, indent=1) + "\n"
+def placed(fix: Fix) -> PlacedFix | None:
+    """Return a fix as files for maps and flights have it; None where nothing was found.
 
-
-def gpx_text(fixes: Sequence[Fix], credit: str) -> str:
-    """Return accepted fixes as waypoints of GPX 1.1."""
-    root = ET.Element("gpx", version="1.1", creator="sasgeo-bench", xmlns="http://www.topografix.com/GPX/1/1")
-    ET.SubElement(ET.SubElement(root, "metadata"), "desc").text = plain(f"map data: {credit}")
-    for fix in _accepted(fixes):
-        point = ET.SubElement(root, "wpt", lat=f"{fix.lat:.7f}", lon=f"{fix.lon:.7f}")
-        if fix.taken_at is not None:
-            # GPX asks for UTC; the camera's clock says no zone, so the time stands in the description.
-            ET.SubElement(point, "cmt").text = plain(f"taken at {fix.taken_at} by the camera's clock")
-        ET.SubElement(point, "name").text = plain(fix.file)
-        ET.SubElement(point, "desc").text = _words(fix)
-    return _xml(root)
-
-
-def kml_text(fixes: Sequence[Fix], credit: str) -> str:
-    """Return accepted fixes as placemarks of KML 2.2, clamped to the ground."""
-    root = ET.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
-    document = ET.SubElement(root, "Document")
-    ET.SubElement(document, "description").text = plain(f"map data: {credit}")
-    for fix in _accepted(fixes):
-        mark = ET.SubElement(document, "Placemark")
-        ET.SubElement(mark, "name").text = plain(fix.file)
-        ET.SubElement(mark, "description").text = _words(fix)
-        point = ET.SubElement(mark, "Point")
-        ET.SubElement(point, "altitudeMode").text = "clampToGround"
-        ET.SubElement(point, "coordinates").text = f"{fix.lon:.7f},{fix.lat:.7f}"
-    return _xml(root)
-
-
-def tum_text(fixes: Sequence[Fix]) -> str:
-    """Return accepted fixes as a TUM trajectory: time, x, y, z and the quaternion x, y, z, w of the heading.
-
-    Time is that of the camera's clock, seconds as if it were UTC; x and y are metres of the map's grid, z the height
-    above the ground as believed. The body's x points ahead: a heading of north is a turn by 90 degrees from east.
+    Its time is that of the camera's clock, as if it were UTC.
     """
-    lines = ["# time x y z qx qy qz qw"]
-    for fix in _accepted(fixes):
-        if fix.taken_at is None or fix.view is None:
-            continue
-        seconds = dt.datetime.fromisoformat(fix.taken_at).replace(tzinfo=dt.UTC).timestamp()
-        half = math.radians(90.0 - fix.view[2]) / 2
-        lines.append(
-            f"{seconds:.3f} {fix.x_m:.3f} {fix.y_m:.3f} {fix.height_m or 0.0:.3f} 0 0 {math.sin(half):.9f} "
-            f"{math.cos(half):.9f}"
-        )
-    return "\n".join(lines) + "\n"
-
-
-def _accepted(fixes: Sequence[Fix]) -> list[Fix]:
-    return [fix for fix in fixes if fix.is_accepted]
-
-
-def _words(fix: Fix) -> str:
-    return plain(f"heading {fix.heading_deg:.0f} deg, P(false fix) {fix.p_false:.3f}")
-
-
-def _xml(root: ET.Element) -> str:
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+    numbers = (fix.lon, fix.lat, fix.x_m, fix.y_m, fix.heading_deg)
+    known = [value for value in numbers if value is not None]
+    if len(known) < len(numbers):
+        return None
+    lon, lat, east_m, north_m, heading_deg = known
+    time_ns, comment = None, ""
+    if fix.taken_at is not None:
+        moment = dt.datetime.fromisoformat(fix.taken_at).replace(tzinfo=dt.UTC)
+        time_ns = round(moment.timestamp() * 1e6) * 1000
+        # GPX asks for UTC; the camera's clock says no zone, so the time stands in a comment.
+        comment = f"taken at {fix.taken_at} by the camera's clock"
+    return PlacedFix(
+        name=fix.file,
+        lon_deg=lon,
+        lat_deg=lat,
+        east_m=east_m,
+        north_m=north_m,
+        heading_deg=heading_deg,
+        yaw_deg=heading_deg if fix.view is None else fix.view[2],
+        is_accepted=fix.is_accepted,
+        p_false=fix.p_false,
+        time_ns=time_ns,
+        delay_s=fix.seconds,
+        height_m=fix.height_m,
+        comment=comment,
+    )
 
 
 _COLOURS: Final = {"found": "#0a7d33", "withheld": "#b36b00", "not on this map": "#a3142a", "failed": "#666666"}

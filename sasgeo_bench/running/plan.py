@@ -71,7 +71,7 @@ _BYTES_PER_MB = 10**6
 # Folders below a root that reveal truths, answers, or what pictures of later queries show.
 _HIDDEN: Final = (
     *("tasks", "truth", "runs", "boards", "release", "results", "sheets", "sealed"),
-    *("segmenters", "private", "datasets", "head-start"),
+    *("segmenters", "private", "datasets", "head-start", "frames"),
 )
 MAPS: Final = ("regions/*", f"{UNPACKED}/*/*")  # below a root: built, and unpacked
 _LEAST_MB, _MOST_MB = 64, 4_000_000

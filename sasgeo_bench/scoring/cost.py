@@ -11,6 +11,7 @@ import pandas as pd
 
 from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.running.prediction_files import RunManifest
+from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 
 BYTES_PER_KB: Final = 1e3
@@ -33,13 +34,20 @@ class Costs:
     area_km2: Mapping[str, float]
 
 
+def latencies_s(scores: pd.DataFrame) -> Floats:
+    """Return the latency of each scored row, or view of a flight, in seconds; NaN where unknown.
+
+    A time-out is infinite: it took at least the limit, and leaving it out would make a slow matcher look fast.
+    """
+    return np.where(scores["status"] == "timeout", np.inf, scores["latency_s"].to_numpy(float))
+
+
 def latency_quantile(costs: Costs, share: float) -> float:
     """Return the least latency in seconds that a share in (0, 1] of the timed queries does not exceed.
 
-    A time-out is infinite: it took at least the limit, and leaving it out would make a slow matcher look fast. Other
-    queries without a time (crashes, refusals, submissions without code) are left out. NaN if none is timed.
+    Queries without a time (crashes, refusals, submissions without code) are left out. NaN if none is timed.
     """
-    latency_s = np.where(costs.scores["status"] == "timeout", np.inf, costs.scores["latency_s"].to_numpy(float))
+    latency_s = latencies_s(costs.scores)
     timed_s = latency_s[~np.isnan(latency_s)]
     return float(np.quantile(timed_s, share, method="inverted_cdf")) if len(timed_s) else math.nan
 

@@ -34,6 +34,13 @@ DIVERGED_M: Final = 100.0
 _DIVERGED_FOR_M: Final = 500.0
 SHARE_INSIDE: Final = 0.95  # of true places, that an honest ellipse of that share holds
 _INSIDE: Final = float(chi2.ppf(SHARE_INSIDE, 2))  # squared distance to the rim of that ellipse
+# Of an honest covariance NEES lies in this band in 95 % of flights if all views of one share their error, and in more
+# if they do not: chi-square with the 3 degrees of freedom of one view (Bar-Shalom et al. 2001, section 5.4.2).
+NEES_BAND: Final = tuple(float(chi2.ppf(tail, SIDE)) / SIDE for tail in (0.025, 0.975))
+FRESH_S: Final = 30.0  # age up to which a fix is of use: some 300 m flown, of which a fair odometer loses 1 %
+HOLDS_S: Final = 60.0  # window of continuity; ICAO's of an approach is 15 s, of a flight en route an hour
+_AGE_SHARE: Final = 0.95
+AGREEING: Final = 3  # accepted fixes in a row that confirm the last of them
 _NEEDED: Final = frozenset({"distance_m", "time_s"})  # measured at each view
 _JUMP_M: Final = 1.0  # more between two views than was flown: the drone was carried
 
@@ -65,6 +72,14 @@ class FlightScore:
     right_accepted: Annotated[float, "Share of the views with one within 25 m"]
     false_accepted: Annotated[float, "Share of the views with one beyond"]
     false_of_accepted: Annotated[float, "Share of the accepted fixes that are false; 0 where none is accepted"]
+    right_confirmed: Annotated[
+        float,
+        "Share of the views with a confirmed fix within 25 m: one that agrees with the accepted fix before it, which "
+        "agrees with the one before. Two agree if the odometer leads from the first to within 25 m of the second",
+    ]
+    false_confirmed: Annotated[float, "Share of the views with a confirmed fix beyond"]
+    false_of_confirmed: Annotated[float, "Share of the confirmed fixes that are false; 0 where none is confirmed"]
+    first_confirmed_m: Annotated[float, "Distance to the first confirmed fix within 25 m; infinite without one"]
     right_per_km: Annotated[float, "Accepted fixes within 25 m over kilometres"]
     false_per_km: Annotated[float, "Those beyond over kilometres"]
     longest_without_fix_m: Annotated[
@@ -76,6 +91,21 @@ class FlightScore:
         float,
         "The same distance from the first view after being carried, or else after the longest gap or stretch off the "
         "map, of two views at least; NaN where the flight has none, or ends in it",
+    ]
+    duration_s: Annotated[float, "Time from the first view to the last"]
+    fix_age_p95_s: Annotated[
+        float,
+        "Age of the last accepted fix, right or not, that is not exceeded in 95 % of that time; until the first fix it "
+        "counts from the start",
+    ]
+    fix_age_longest_s: Annotated[float, "The longest such age"]
+    fix_age_p95_m: Annotated[float, "The same as fix_age_p95_s in metres flown since, of the way"]
+    fix_age_longest_m: Annotated[float, "The most metres flown since"]
+    available_30s: Annotated[float, "Share of the time with an accepted fix that is 30 s old at most"]
+    continuity_60s: Annotated[
+        float,
+        "Of the moments with such a fix, 60 s or more before the end, the share from which on there is one all 60 s "
+        "long; 0 without such a moment, NaN of a shorter flight",
     ]
     divergences: Annotated[int, "Number of stretches of more than 500 m with accepted fixes all beyond 100 m"]
     ate_m: Annotated[
@@ -91,6 +121,9 @@ class FlightScore:
         "an inverse",
     ]
     nees_off: Annotated[float, "Its absolute logarithm: 0 for an honest covariance"]
+    nees_in_band: Annotated[
+        bool, f"It lies in chi-square's band of 95 % for one view, {NEES_BAND[0]:.2f} to {NEES_BAND[1]:.2f}"
+    ]
     inside_95: Annotated[
         float,
         "Share of the views with an estimate whose true position lies in its ellipse of 95 %; without one it does not",
@@ -277,7 +310,9 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
     first_fix_m = _first(distance_m - distance_m[0], right)
     event = _event(column["is_seen"] & column["is_present"], column["is_carried"])
     reckoned, answered = _Reckoned.of(views, increments), column["is_answered"].astype(bool)
+    confirmed = reckoned.confirmed()
     nees = float(column["nees"][answered].mean()) if answered.any() else math.inf
+    time_s = column["time_s"].astype(float)
     return FlightScore(
         views=len(views),
         length_m=length_m,
@@ -287,18 +322,30 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
         right_accepted=float(right.mean()),
         false_accepted=float(false.mean()),
         false_of_accepted=float(false.sum() / max(1, accepted.sum())),
+        right_confirmed=float((confirmed & right).mean()),
+        false_confirmed=float((confirmed & false).mean()),
+        false_of_confirmed=float((confirmed & false).sum() / max(1, confirmed.sum())),
+        first_confirmed_m=_first(distance_m - distance_m[0], confirmed & right),
         right_per_km=float(right.sum()) * per_km,
         false_per_km=float(false.sum()) * per_km,
         longest_without_fix_m=_longest(distance_m, right),
         first_fix_m=first_fix_m,
-        first_fix_s=_first(column["time_s"].astype(float), right),
+        first_fix_s=_first(time_s, right),
         reacquired_m=math.nan if event is None else _first(distance_m[event:] - distance_m[event], right[event:]),
+        duration_s=float(time_s[-1] - time_s[0]),
+        fix_age_p95_s=age_quantile(time_s, accepted),
+        fix_age_longest_s=_longest(time_s, accepted),
+        fix_age_p95_m=age_quantile(distance_m, accepted),
+        fix_age_longest_m=_longest(distance_m, accepted),
+        available_30s=availability(time_s, accepted, FRESH_S),
+        continuity_60s=continuity(time_s, accepted, FRESH_S, HOLDS_S),
         divergences=_divergences(distance_m, accepted & (error_m > DIVERGED_M), accepted),
         ate_m=float(np.sqrt(np.mean(error_m**2))),
         error_p50_m=_quantile(error_m, 0.5),
         error_p95_m=_quantile(error_m, 0.95),
         nees=nees,
         nees_off=abs(math.log(nees)) if 0 < nees < math.inf else math.inf,
+        nees_in_band=NEES_BAND[0] <= nees <= NEES_BAND[1],
         inside_95=float(column["is_inside"][answered].mean()) if answered.any() else 0.0,
         odometer_drift=reckoned.drift(),
     )
@@ -343,6 +390,76 @@ def _longest(distance_m: Floats, is_fix: Bools) -> float:
     return float(np.diff(known).max())
 
 
+def age_quantile(at: Floats, is_fix: Bools, share: float = _AGE_SHARE) -> float:
+    """Return the age of the last fix that is not exceeded during a share of the way or time, in its unit.
+
+    `at`, shape (N,), are places or moments of views in ascending order; until the first fix the age counts from the
+    start. Between views it grows, so that of a gap of length g a part of g - a is older than a; the gaps together hold
+    1 - share of the whole at the age sought, which is the most that the longest k gaps ask for, over all k.
+
+    Gaps of 10 and 30 s: of 40 s the last 2 s of the longer one are older than 28 s.
+
+    >>> round(age_quantile(np.array([0.0, 10.0, 20.0, 40.0]), np.array([True, True, False, False])), 6)
+    28.0
+    """
+    known = np.concatenate([at[:1], at[is_fix], at[-1:]])
+    gaps = np.sort(np.diff(known))[::-1]
+    rest = (1.0 - share) * (at[-1] - at[0])
+    return float(max(0.0, ((np.cumsum(gaps) - rest) / np.arange(1, len(gaps) + 1)).max()))
+
+
+def availability(time_s: Floats, is_fix: Bools, age_s: float) -> float:
+    """Return the share of the time with a fix that is `age_s` old at most; there is none before the first.
+
+    >>> availability(np.array([0.0, 10.0, 60.0, 100.0]), np.array([False, True, True, False]), 30.0)
+    0.6
+    """
+    known = np.append(time_s[is_fix], time_s[-1])
+    whole_s = float(time_s[-1] - time_s[0])
+    return float(np.minimum(np.diff(known), age_s).sum() / whole_s) if whole_s > 0 else float(is_fix.any())
+
+
+def continuity(time_s: Floats, is_fix: Bools, age_s: float, holds_s: float) -> float:
+    """Return the chance that a fix of `age_s` at most is there for `holds_s` more, given that there is one.
+
+    It is over all moments with such a fix that lie `holds_s` or more before the end; 0 without any, NaN if the flight
+    is shorter.
+
+    ICAO Annex 10, volume I, attachment D: the probability that a service that is there at the beginning
+    of an operation is there until its end.
+
+    There is a fix for 30 s, of which the first 10 s have it 20 s later:
+
+    >>> continuity(np.array([0.0, 100.0]), np.array([True, False]), 30.0, 20.0)
+    0.3333333333333333
+    """
+    last_s = float(time_s[-1]) - holds_s
+    if not last_s > time_s[0]:
+        return math.nan
+    fixes_s = time_s[is_fix]
+    if not len(fixes_s):
+        return 0.0
+    is_parted = np.diff(fixes_s) > age_s
+    since_s = fixes_s[np.append(np.array([True]), is_parted)]
+    until_s = fixes_s[np.append(is_parted, np.array([True]))] + age_s
+    whole_s = np.maximum(np.minimum(until_s, last_s) - since_s, 0.0).sum()
+    held_s = np.maximum(np.minimum(until_s - holds_s, last_s) - since_s, 0.0).sum()
+    return float(held_s / whole_s) if whole_s > 0 else 0.0
+
+
+def share_within(views: pd.DataFrame, within_m: float, within_deg: float) -> dict[str, float]:
+    """Return by flight the share of its way with an estimate within metres and degrees, accepted or not.
+
+    `views` are rows of `view_frame`; an error equal to a limit is within it.
+    """
+    is_near = (views["error_m"] <= within_m) & (views["yaw_error_deg"] <= within_deg)
+    names, distance_m = views["sequence_id"].tolist(), views["distance_m"].to_numpy(float)
+    return {
+        names[first]: _share(_ways_m(distance_m[first:last]), is_near.to_numpy(bool)[first:last])
+        for first, last in pairwise(_ends(names))
+    }
+
+
 def _event(is_sighted: Bools, is_carried: Bools) -> int | None:
     """Return the first view after the drone was carried, or else after the longest stretch of views without a place.
 
@@ -377,6 +494,7 @@ class _Reckoned:
     fixes: Complexes
     fix_yaw: Floats  # radians
     accepted: Bools
+    has_step: Bools  # the odometer says what lies between the view and the one before
     is_lost: Bools  # on the way to the view: by the odometer, or since the drone was carried
     way: Complexes
     turn: Floats  # radians
@@ -394,6 +512,7 @@ class _Reckoned:
             fixes=column["east_m"] + 1j * column["north_m"],
             fix_yaw=np.radians(views["yaw_deg"].to_numpy(float)),
             accepted=views["is_accepted"].to_numpy(bool),
+            has_step=np.array([one is not None for one in increments]),
             is_lost=np.array([one is None for one in increments]) | views["is_carried"].to_numpy(bool),
             way=way_m[:, 0] + 1j * way_m[:, 1],
             turn=np.cumsum(np.radians(steps[:, 2])),
@@ -410,6 +529,24 @@ class _Reckoned:
         turned = np.exp(-1j * (self.true_yaw[first] - self.turn[first]))
         off = np.abs(self.true[first] + (self.way[last] - self.way[first]) * turned - self.true[last])
         return min(1.0, float(np.mean(off / (self.distance_m[last] - self.distance_m[first]))))
+
+    def confirmed(self) -> Bools:
+        """Return which views have an accepted fix that the ones before confirm: `AGREEING` in a row agree.
+
+        Two agree if the odometer, which knows nothing of being carried, leads from the first to within 25 m of the
+        second. It cannot where it lost its way.
+        """
+        at = np.flatnonzero(self.accepted)
+        first, second = at[:-1], at[1:]
+        turned = np.exp(-1j * (self.fix_yaw[first] - self.turn[first]))
+        off_m = np.abs(self.fixes[first] + (self.way[second] - self.way[first]) * turned - self.fixes[second])
+        steps = np.cumsum(self.has_step)
+        agree = (off_m <= FIX_M) & (steps[second] - steps[first] == second - first)
+        found = np.zeros(len(self.accepted), dtype=bool)
+        in_a_row = AGREEING - 1
+        if len(agree) >= in_a_row:
+            found[at[in_a_row:]] = np.convolve(agree, np.ones(in_a_row), "valid") == in_a_row
+        return found
 
     def error_m(self, every_m: float) -> Floats:
         """Return the error of every view if a fix is used once in some metres at most, and the odometer then."""

@@ -25,7 +25,16 @@ from sasgeo_bench.scoring.decisions import (
     excess_aurc,
     false_fix_rate,
 )
-from sasgeo_bench.scoring.flights import RECKONED_M, SHARE_INSIDE, SOON_M, WITHIN_M
+from sasgeo_bench.scoring.flights import (
+    AGREEING,
+    FRESH_S,
+    HOLDS_S,
+    NEES_BAND,
+    RECKONED_M,
+    SHARE_INSIDE,
+    SOON_M,
+    WITHIN_M,
+)
 from sasgeo_bench.scoring.metric import (
     CostMetric,
     MeanMetric,
@@ -34,7 +43,7 @@ from sasgeo_bench.scoring.metric import (
     RejectionMetric,
     ThresholdMetric,
 )
-from sasgeo_bench.scoring.pose import PoseErrors, Ranks, area_values, hits, reciprocal_ranks, successes
+from sasgeo_bench.scoring.pose import SUCCESS_DEG, PoseErrors, Ranks, area_values, hits, reciprocal_ranks, successes
 from sasgeo_bench.tasks.query import SEQUENCE, TRUTH_SIGMA
 
 _INF: Final = float("inf")
@@ -50,6 +59,10 @@ def _is_longer(scores: pd.DataFrame, than_m: float) -> Bools:
 
 def _has_event(scores: pd.DataFrame) -> Bools:
     return scores["reacquired_m"].notna().to_numpy(bool)
+
+
+def _lasts(scores: pd.DataFrame) -> Bools:
+    return scores["continuity_60s"].notna().to_numpy(bool)
 
 
 def _soon(scores: pd.DataFrame) -> Floats:
@@ -137,6 +150,46 @@ MEANS: Final = (
         "with an estimate; without a covariance it holds none",
         values=_off_inside,
     ),
+    _flight_mean(
+        "inside_95",
+        "Share of the true positions within the covariance's ellipse of 95 %, of the views with an estimate: 0.95 for "
+        "an honest covariance, less for one that is too small",
+        better="higher",
+    ),
+    _flight_mean(
+        "nees_in_band",
+        f"Share of the flights whose NEES lies between {NEES_BAND[0]:.2f} and {NEES_BAND[1]:.2f}, chi-square's band of "
+        "95 % for a single view. As views of a flight share errors, that of an honest covariance is 0.95 at least",
+        source="Bar-Shalom, Li and Kirubarajan, Estimation with Applications, 2001, section 5.4.2",
+        better="higher",
+    ),
+    _flight_mean(
+        "right_confirmed",
+        f"Share of the views with a confirmed fix within 25 m: the last of {AGREEING} accepted ones in a row of which "
+        "the odometer leads from each to within 25 m of the next",
+        better="higher",
+    ),
+    _flight_mean("false_confirmed", "Share of the views with a confirmed fix beyond 25 m", read_with="right_confirmed"),
+    _flight_mean(
+        "false_of_confirmed",
+        "Share of a flight's confirmed fixes that are beyond 25 m; 0 where none is confirmed",
+        read_with="right_confirmed",
+    ),
+    _flight_mean(
+        "available_30s",
+        f"Availability: share of the time with an accepted fix, right or not, that is {FRESH_S:g} s old at most. There "
+        "is none before the first",
+        source="ICAO Annex 10, volume I, attachment D, with the age as the requirement",
+        better="higher",
+    ),
+    _flight_mean(
+        "continuity_60s",
+        f"Continuity: given an accepted fix that is {FRESH_S:g} s old at most, the chance that there is one all along "
+        f"the next {HOLDS_S:g} s; 0 for a flight that never has one. Flights of {HOLDS_S:g} s or less are not counted",
+        source="ICAO Annex 10, volume I, attachment D, with this age and this window",
+        better="higher",
+        counts=_lasts,
+    ),
 )
 _LOWER: Final = "; of an even number of flights the lower middle"
 _quantile = partial(
@@ -191,6 +244,36 @@ FLIGHT_QUANTILES: Final = (
         source="Bar-Shalom, Li and Kirubarajan, Estimation with Applications, 2001, section 5.4",
         column="nees_off",
     ),
+    _quantile(
+        name="first_confirmed",
+        meaning="Median over flights of the distance to the first confirmed fix within 25 m, which comes later than "
+        f"first_fix by the delay of confirmation; infinite without one{_LOWER}",
+        unit="m",
+        column="first_confirmed_m",
+    ),
+    _quantile(
+        name="nees",
+        meaning="Median over flights of NEES itself, the mean normalized estimation error squared over 3: 1 for an "
+        "honest covariance, 4 for one whose standard deviations are half of what they should be; infinite if an "
+        f"estimate has none{_LOWER}",
+        source="Bar-Shalom, Li and Kirubarajan, Estimation with Applications, 2001, section 5.4",
+        column="nees",
+    ),
+    *(
+        _quantile(
+            name=f"fix_age_{word}_{unit}",
+            meaning=f"Median over flights of {what}; until the first fix it counts from the start{_LOWER}",
+            source="age of information: Kaul, Yates and Gruteser, INFOCOM 2012",
+            unit=unit,
+            column=f"fix_age_{word}_{unit}",
+        )
+        for word, unit, what in (
+            ("p95", "s", "the age of the last accepted fix, right or not, that is not exceeded in 95 % of the time"),
+            ("longest", "s", "the longest age of the last accepted fix, right or not"),
+            ("p95", "m", "the metres flown since the last accepted fix that are not exceeded on 95 % of the way"),
+            ("longest", "m", "the most metres flown since the last accepted fix, right or not"),
+        )
+    ),
 )
 
 
@@ -222,7 +305,7 @@ def is_present(scores: pd.DataFrame) -> Bools:
     return scores["is_present"].to_numpy(bool)
 
 
-def _successes(scores: pd.DataFrame, within_m: float, within_deg: float = 5.0) -> Floats:
+def _successes(scores: pd.DataFrame, within_m: float, within_deg: float = SUCCESS_DEG) -> Floats:
     return successes(errors_of(scores), within_m, within_deg).astype(float)
 
 
@@ -265,6 +348,51 @@ WITHIN: Final = _mean(  # shows the effect of wrong headings on the primary metr
     values=lambda scores: scores["is_right"].to_numpy(float),
     counts=partial(_is_sharp, within_m=SUCCESS_M[0]),
 )
+ANY_DEG: Final = 180.0  # of a heading that does not count
+
+
+def within_name(within_m: float = _INF, within_deg: float = ANY_DEG) -> str:
+    """Return the name of the share of queries within metres, degrees, or both.
+
+    >>> within_name(50.0), within_name(within_deg=2.0), within_name(25.0, 5.0), within_name(5.0, 2.0)
+    ('within_50m', 'within_2deg', 'success_25m', 'success_5m_2deg')
+    """
+    if within_deg == ANY_DEG:
+        return f"within_{within_m:g}m"
+    if within_m == _INF:
+        return f"within_{within_deg:g}deg"
+    return f"success_{within_m:g}m" + ("" if within_deg == SUCCESS_DEG else f"_{within_deg:g}deg")
+
+
+def within_metric(within_m: float = _INF, within_deg: float = ANY_DEG) -> MeanMetric:
+    """Return the share of queries whose fix is within metres, whose heading is within degrees, or both.
+
+    Places whose truth is not known to half of the metres do not count.
+
+    >>> near = within_metric(5.0)
+    >>> near.name, near.values(pd.DataFrame({"position_error_m": [5.0, np.inf], "yaw_error_deg": [90.0, np.inf]}))
+    ('within_5m', array([1., 0.]))
+    """
+    near = f"whose position is within {within_m:g} m, whatever the heading"
+    if within_m == _INF:
+        near = f"whose heading is within {within_deg:g} deg, wherever the fix is"
+    elif within_deg != ANY_DEG:
+        near = f"whose pose is within {within_m:g} m and {within_deg:g} deg"
+    return _mean(
+        name=within_name(within_m, within_deg),
+        meaning=f"Share of queries {near}. No answer is a miss",
+        source="recall at metres and degrees, as in Sarlin et al., CVPR 2023",
+        tracks=(LOCALIZATION,),
+        values=partial(_near, within_m=within_m, within_deg=within_deg),
+        counts=partial(_is_sharp, within_m=within_m),
+    )
+
+
+def _near(scores: pd.DataFrame, within_m: float, within_deg: float) -> Floats:
+    is_near = (_column(scores, "position_error_m") <= within_m) & (_column(scores, "yaw_error_deg") <= within_deg)
+    return is_near.astype(float)
+
+
 CEILING: Final = _mean(  # the same for every matcher
     name="ceiling",
     meaning="The most that a matcher can expect of the first figure: 1 in k where k places are the same",
@@ -293,6 +421,8 @@ _MEANS: Final = (
         for within_m in SUCCESS_M
     ),
     WITHIN,
+    *(within_metric(within_m) for within_m in SUCCESS_M[1:]),
+    within_metric(within_deg=SUCCESS_DEG),
     CEILING,
     _mean(
         name="success_auc_50m",
@@ -330,12 +460,16 @@ QUANTILES: Final = (
     *(
         _error(
             name=f"position_{word}",
-            meaning=f"Position error that {100 * share:g} % of the queries do not exceed; infinite without an answer",
+            meaning=f"Position error that {100 * share:g} % of the queries do not exceed{also}; infinite without an "
+            "answer",
             unit="m",
             column="position_error_m",
             share=share,
         )
-        for word, share in (("median", 0.5), ("p90", 0.9), ("p99", 0.99))
+        for word, share, also in (
+            *(("median", 0.5, ""), ("p90", 0.9, "")),
+            *(("p95", 0.95, ": R95, a radius"), ("p99", 0.99, "")),
+        )
     ),
     _error(
         name="yaw_median",

@@ -454,6 +454,7 @@ class Photo:
     flight: Attitude | None = None
     lens: Lens = Lens()
     taken_at: dt.datetime | None = None
+    utc_offset: dt.timedelta | None = None
     model: str = ""
 
     def intrinsics(self) -> Intrinsics:
@@ -582,7 +583,8 @@ def photo_of(name: str, head: PhotoHead, *, most_pixels: int = 200_000_000) -> P
         gimbal_fault=angles.fault,
         flight=body_angles(head.xmp),
         lens=_lens(head.inner, head.xmp, make),
-        taken_at=_time(head.inner.get(ExifTags.Base.DateTimeOriginal)),
+        taken_at=_time(head.inner),
+        utc_offset=_utc_offset(head.inner),
         model=_text(head.exif.get(ExifTags.Base.Model)),
     )
 
@@ -650,8 +652,21 @@ def _degrees(parts: object, side: object, plus: str, minus: str) -> float | None
     return degrees if side == plus else -degrees
 
 
-def _time(text: object) -> dt.datetime | None:
+def _utc_offset(inner: Mapping[int, Any]) -> dt.timedelta | None:
+    """Return how far the clock is ahead of UTC (EXIF 2.31, OffsetTimeOriginal); None where the file does not say."""
+    text = _text(inner.get(ExifTags.Base.OffsetTimeOriginal))
+    found = re.fullmatch(r"([+-])([0-9]{2}):([0-9]{2})", text.strip())
+    if found is None:
+        return None
+    offset = dt.timedelta(hours=int(found[2]), minutes=int(found[3]))
+    return -offset if found[1] == "-" else offset
+
+
+def _time(inner: Mapping[int, Any]) -> dt.datetime | None:
+    text = _text(inner.get(ExifTags.Base.DateTimeOriginal))
     try:
-        return dt.datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")  # noqa: DTZ007 - EXIF has no zone here
+        moment = dt.datetime.strptime(text, "%Y:%m:%d %H:%M:%S")  # noqa: DTZ007 - EXIF has no zone here
     except ValueError:
         return None
+    fraction = _text(inner.get(ExifTags.Base.SubsecTimeOriginal))  # digits behind the point
+    return moment + dt.timedelta(seconds=float(f"0.{fraction}")) if re.fullmatch("[0-9]{1,9}", fraction) else moment

@@ -182,7 +182,14 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
         over = base if scene.pictured is None else base.within(scene.pictured.footprint)
         flown = None if request.flown is None else request.flown.over(over, margin_m=suite.clear_m(scene))
         airspace = Airspace(
-            region=over, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group, flown=flown
+            region=over,
+            scene=scene,
+            suite=suite,
+            split=request.split,
+            seeds=seeds,
+            group=group,
+            flown=flown,
+            start_s=None if request.flown is None else request.flown.start_s,
         )
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
         airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))

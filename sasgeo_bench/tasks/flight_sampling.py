@@ -59,6 +59,7 @@ from sasgeo_bench.tasks.suites.flights import (
 
 Floats = NDArray[np.float64]
 
+UTC: Final = "utc_s"  # measured: when a view of a logged flight was flown, seconds since 1970; the log may not tell it
 _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 
 
@@ -93,7 +94,8 @@ def pose_of(views: Trajectory, frame: int, scale: float) -> Pose:
 class Airspace:
     """Where the flights of a suite may go, and the seeds of region and suite that they are drawn from.
 
-    `flown` is a flight that was flown there; it is the only one then.
+    `flown` is a flight that was flown there; it is the only one then. `start_s` is when its clock was 0, seconds since
+    1970, UTC, if that is known.
     """
 
     region: Region
@@ -103,6 +105,7 @@ class Airspace:
     seeds: Seeds
     group: PriorGroup
     flown: Trajectory | None = None
+    start_s: float | None = None
 
     def seeds_of(self, index: int) -> Seeds:
         """Return the seeds of one flight."""
@@ -380,6 +383,8 @@ class FlightDrawer:
             step = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
             flown = {"distance_m": round(float(distance_m[frame]), 1), "time_s": round(float(time_s[frame]), 2)}
             own = flown | {"is_seen": float(not unseen[frame])}
+            if self.airspace.start_s is not None:
+                own[UTC] = round(self.airspace.start_s + float(views.time_s[frame]), 3)
             yield self._view(job, mission, pose_of(views, frame, flight.scale), step, own | measured)
 
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:

@@ -81,7 +81,7 @@ class PriorGroup:
     yaw : {"known", "weak", "unknown"}
         Standard deviation of the heading: 5 degrees, 20 degrees, or nothing known.
     scale_sigma : float
-        Standard deviation of the scale around 1: 0.03, 0.10 or 0.15.
+        Standard deviation of the scale around 1: 0.01 (a laser altimeter), 0.03, 0.10 or 0.15.
 
     Examples
     --------
@@ -114,14 +114,14 @@ class PriorGroup:
         groups = {group.name: group for group in (cls(radius_m=r, yaw=y, scale_sigma=s) for r, y, s in declared)}
         if name not in groups:
             raise ConfigError(
-                f"{name!r} is no prior group: r100, r250, r500, r2000 or rnone, then known, weak or unknown yaw, "
-                "then s3, s10 or s15, as in r500-weak-s3"
+                f"{name!r} is no prior group: r50, r100, r250, r500, r2000 or rnone, then known, weak or unknown yaw, "
+                "then s1, s3, s10 or s15, as in r500-weak-s3"
             )
         return groups[name]
 
 
-RADII_M: Final = (None, 100.0, 250.0, 500.0, 2000.0)
-SCALE_SIGMAS: Final = (0.03, 0.10, 0.15)
+RADII_M: Final = (None, 50.0, 100.0, 250.0, 500.0, 2000.0)
+SCALE_SIGMAS: Final = (0.01, 0.03, 0.10, 0.15)
 YAWS: Final[tuple[Yaw, ...]] = ("known", "weak", "unknown")
 
 

@@ -136,6 +136,55 @@ def test_stored_results_give_the_same_board(out):
     pd.testing.assert_frame_equal(first[columns], second[columns], check_dtype=False)
 
 
+ASKED = {
+    "within": ["5m,1deg"],
+    "require": ["80% within 50 m, p95 latency 400 ms", "false <= 1%, available_30s >= 30%"],
+}
+
+
+@pytest.mark.usefixtures("plain_site")
+def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results_scored_again(out, tmp_path):
+    results = tmp_path / "results"
+    board = score(predictions=out / "runs", out=out, name="asked", draws=100, cases=False, results=results, **ASKED)
+    mine = board.leaderboard[board.leaderboard["metric"] == "distance_within_5m_1deg"]
+    assert mine[mine["stratum"] == "all"].set_index("matcher")["value"].to_dict() == {"near": 1.0, "far": 0.0}
+    plain = read_leaderboard(out / "boards" / "mine")
+    more = {"distance_within_5m_1deg", "latency_within_0.4s"}
+    rest = board.leaderboard[~board.leaderboard["metric"].isin(more)].reset_index(drop=True)
+    pd.testing.assert_frame_equal(rest, plain)  # not a digit of the others depends on what is asked
+    found = board.requirements.set_index(["requirement", "matcher"])["verdict"]
+    assert found["80% within 50 m"].to_dict() == dict.fromkeys(("far", "near"), "not shown")  # flights are few
+    assert (found["false <= 1%", "far"], found["available_30s >= 30%", "near"]) == ("fails", "passes")
+
+    about = json.loads((board.folder / "board.json").read_text(encoding="utf-8"))
+    assert {name: about[name] for name in ASKED} == ASKED
+    assert not ASKED.keys() & json.loads((out / "boards" / "mine" / "board.json").read_text(encoding="utf-8")).keys()
+    again = score(predictions=results / "asked", out=tmp_path, name="asked", cases=False)
+    pd.testing.assert_frame_equal(again.requirements, board.requirements)
+    site = publish(again.folder, tmp_path / "site", root=out).folder
+    text = (site / "index.html").read_text(encoding="utf-8")
+    assert "Who meets the requirements" in text
+    assert "files/requirements.parquet" in text
+    assert "available_30s &gt;= 30%" in text
+    (page,) = site.glob(f"suite*{SUITE}*.html")
+    assert "Share of the flown distance with an estimate within 5m and 1deg" in page.read_text(encoding="utf-8")
+    text = (board.folder / "leaderboard.md").read_text(encoding="utf-8")
+    assert "| matcher | all | 80% within 50 m |" in text
+    assert "## Fixes in use: flight-overconfident" in text
+
+
+@pytest.mark.parametrize(
+    ("flag", "text", "fault"),
+    [
+        ("--within", "5 feet", "--within says '5 feet': '5 feet' is no limit"),
+        ("--require", "fast enough", "--require says 'fast enough', which is no requirement: say it as in '80% within"),
+    ],
+)
+def test_what_is_no_limit_or_requirement_is_a_line_and_leaves_no_board(out, mistake, flag, text, fault):
+    assert fault in mistake("score", "--predictions", out / "runs", "--name", "odd", "--out", out, flag, text)
+    assert not (out / "boards" / "odd").exists()
+
+
 def test_a_run_of_flights_is_listed_and_its_worst_flight_drawn(out, program):
     code, printed, _ = program("inspect", str(out / "runs" / "far"), "--out", str(out))
     assert code == 0
@@ -234,3 +283,18 @@ def test_the_page_plays_in_a_browser_from_a_file_and_asks_nobody(out, tmp_path):
             time.sleep(0.05)
         assert [url for url in page.asked if not url.startswith(("file:", "data:"))] == []
         assert page.faults == []
+
+
+def test_the_receiver_is_checked_by_the_fixes_of_a_run(out, program, mistake):
+    code, printed, err = program("check-gnss", str(out / "runs" / "near"), "--out", str(out), "--pull-off", "2,20")
+    assert code == 0, err
+    rows = [line.split() for line in printed.splitlines()[1:] if line.strip()]
+    assert [row[:3] for row in rows] == [[SUITE, REGION, "6"]] * 2
+    assert [row[4] for row in rows] == ["0.00"] * 2  # false alarms: its fixes are 3 m off
+    assert rows[1][6] == "100%"
+    # fixes that are accepted 40 m off alarm every flight
+    printed = program("check-gnss", str(out / "runs" / "far"), "--out", str(out))[1]
+    assert float(printed.splitlines()[1].split()[4]) > 0
+    assert "--pull-off must be positive metres a second" in mistake(
+        "check-gnss", out / "runs" / "near", "--pull-off", "0"
+    )

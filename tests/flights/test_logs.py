@@ -264,7 +264,7 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(wri
         ("a.kml", LINE.format("9.52, 47.14"), "point 1: longitude is no number|latitude is missing|is no longitude"),
         ("a.kml", LINE.format("9.52 47.14"), "point 1: '9.52' is no longitude, latitude and altitude"),
         ("a.kmz", "PK", "no sound KMZ"),
-        ("a.zip", "PK", "no flight log that is read: .gpx, .kml, .kmz, .ulg, .*.csv, .pos, .tum, .txt, .*gz are"),
+        ("a.zip", "PK", "no flight log that is read: .gpx, .kml, .kmz, .srt, .ulg, .*.csv, .pos, .tum, .txt, .*gz are"),
     ],
 )  # fmt: skip
 def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(written, name, text, match) -> None:

@@ -22,16 +22,18 @@ from scipy.spatial.transform import Rotation
 import sasgeo_bench as sgb
 from sasgeo_bench.cli.observing import line_of
 from sasgeo_bench.core.errors import ConfigError, MatchError
-from sasgeo_bench.geometry.projection import to_lonlat
+from sasgeo_bench.geometry.projection import to_grid, to_lonlat
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.observing import locate as locating
 from sasgeo_bench.observing.chances import Chances, answers_for, shipped_answers
 from sasgeo_bench.observing.fixes import COLUMNS, Fix, LocateRequest, verdict
 from sasgeo_bench.observing.locate import answer_key, locate, map_of
 from sasgeo_bench.observing.pictures import Told
-from sasgeo_bench.observing.results import csv_text, geojson_text, gpx_text, kml_text, page_text, tum_text
+from sasgeo_bench.observing.results import csv_text, page_text, write_results
 from sasgeo_bench.regions.packed_map import pack_map
 from sasgeo_bench.sensing.crops import drawn_crops
+from tests.flights.test_log_subtitles import block
+from tests.videos import write_video
 
 TOWN = "town-riverside"
 SIDE_PX, PIXEL_M = 448, 0.5
@@ -83,6 +85,30 @@ def test_a_drawn_picture_is_found_where_it_was_drawn(located, crop):
     lon, lat = to_lonlat(found.manifest.epsg).transform(fix.x_m, fix.y_m)
     assert (fix.lon, fix.lat) == pytest.approx((lon, lat), abs=1e-6)
     assert fix.p_false <= 0.1
+
+
+def test_frames_of_a_video_are_found_where_they_were_drawn(towns: Path, crop, tmp_path):
+    """A second of one picture, from so high that its pixels are as wide, with what a DJI writes beside it."""
+    manifest = sgb.read_region(towns / "regions" / TOWN).manifest
+    lon, lat = to_lonlat(manifest.epsg).transform(crop.pose.easting_m, crop.pose.northing_m)
+    heading = crop.pose.yaw_deg - to_grid(lon, lat, manifest.epsg)[2]
+    height_m = crop.pixel_m * 24.0 * math.hypot(SIDE_PX, SIDE_PX) / math.hypot(36.0, 24.0)
+    said = (
+        f"[focal_len: 24.00] [latitude: {lat:.7f}] [longitude: {lon:.7f}] [rel_alt: {height_m:.2f} abs_alt: 0.0] "
+        f"[gb_yaw: {heading:.1f} gb_pitch: -90.0 gb_roll: 0.0]"
+    )
+    video = write_video(tmp_path / "DJI_0001.MP4", [crop.rgb] * 10)
+    video.with_suffix(".SRT").write_text("".join(block(at, said, step_ms=500) for at in (1, 2, 3)))
+    found = sgb.locate(video, out=towns, into=tmp_path / "into", region=TOWN, most_false=0.1, trusted=True, every=5.0)
+    (fix,) = found.fixes
+    assert (fix.file, fix.status) == ("DJI_0001_00000.000s.jpg", "found")
+    assert off(fix, crop.pose) < 5.0
+    assert fix.file_distance_m == pytest.approx(off(fix, crop.pose), abs=0.5)
+
+
+def test_flags_of_a_video_are_refused_of_pictures(pictures: Path, towns: Path):
+    with pytest.raises(ConfigError, match="--every is of a video, and these pictures are none: leave it out"):
+        sgb.locate(pictures / "c.png", out=towns, region=TOWN, ground_width=200.0, every=2.0)
 
 
 def test_the_position_in_the_file_lies_in_the_disc_and_not_in_its_middle(located, crop):
@@ -187,7 +213,7 @@ def test_a_line_that_was_cut_off_is_asked_again(located, tmp_path):
     into, _ = located
     text = (into / "answers.jsonl").read_text()
     (tmp_path / "answers.jsonl").write_text(text[: len(text) - 40])
-    kept, whole = locating._kept(tmp_path / "answers.jsonl"), locating._kept(into / "answers.jsonl")
+    kept, whole = locating.read_answers(tmp_path / "answers.jsonl"), locating.read_answers(into / "answers.jsonl")
     assert len(kept) == len(whole) - 1
     assert all(whole[key] == fix for key, fix in kept.items())
 
@@ -327,25 +353,33 @@ FIXES = (
 )
 
 
-def test_tables_hold_all_pictures_and_tracks_the_accepted_ones():
+@pytest.fixture(scope="module")
+def files(located, tmp_path_factory) -> Path:
+    """The files about `FIXES`."""
+    folder = tmp_path_factory.mktemp("files")
+    write_results(replace(located[1], request=replace(located[1].request, into=folder), fixes=FIXES))
+    return folder
+
+
+def test_tables_hold_all_pictures_and_tracks_the_accepted_ones(files):
     rows = list(csv.DictReader(csv_text(FIXES).splitlines()))
     assert [row["file"] for row in rows] == ["<b>&.jpg", "'=1+1.jpg", "c.jpg"]
     assert rows[1]["reason"] == "2 places, alike"
-    places = json.loads(geojson_text(FIXES, "(c) OpenStreetMap contributors, ODbL"))
+    places = json.loads((files / "locate.geojson").read_text())
     assert [one["geometry"]["coordinates"] for one in places["features"]] == [[9.5, 47.1], [9.6, 47.2]]
     assert "OpenStreetMap" in places["attribution"]
-    gpx = ET.fromstring(gpx_text(FIXES, "credit"))  # noqa: S314 - our own text
+    gpx = ET.fromstring((files / "locate.gpx").read_text())  # noqa: S314 - our own text
     space = "{http://www.topografix.com/GPX/1/1}"
     points = gpx.findall(f"{space}wpt")
     assert [(one.get("lat"), one.get("lon"), one.findtext(f"{space}name")) for one in points] == [
         ("47.1000000", "9.5000000", "<b>&.jpg")
     ]
-    kml = ET.fromstring(kml_text(FIXES, "credit"))  # noqa: S314
+    kml = ET.fromstring((files / "locate.kml").read_text())  # noqa: S314
     assert kml.find(".//{http://www.opengis.net/kml/2.2}coordinates").text == "9.5000000,47.1000000"
 
 
-def test_a_trajectory_has_the_heading_as_scipy_reads_it():
-    (head, line) = tum_text(FIXES).splitlines()
+def test_a_trajectory_has_the_heading_as_scipy_reads_it(files):
+    (head, line) = (files / "locate.tum").read_text().splitlines()
     assert head.startswith("#")
     numbers = np.array(line.split(), dtype=float)
     assert numbers[0] == 1714558830.0  # 2024-05-01 10:20:30 UTC

@@ -14,7 +14,14 @@ from sasgeo_bench.core.errors import ConfigError, MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts, evaluate_contrasts
-from sasgeo_bench.scoring.flights import FLIGHT_COLUMNS, score_flights
+from sasgeo_bench.scoring.flights import (
+    FLIGHT_COLUMNS,
+    NEES_BAND,
+    age_quantile,
+    availability,
+    continuity,
+    score_flights,
+)
 from sasgeo_bench.scoring.metrics import means_of, primary_of, quantiles_of
 from sasgeo_bench.scoring.score import COLUMNS, MISSING
 from sasgeo_bench.scoring.tables import leaderboard
@@ -364,3 +371,101 @@ def test_what_flights_can_show_follows_from_the_spread_of_their_differences_and_
 
     assert detectable(spread=0.4) == pytest.approx((1.96 + 0.8416) * 0.4 / 4, rel=1e-3)
     assert math.isnan(detectable(discordant=0.5))
+
+
+def ages_at(time_s, is_fix, moments):
+    """Return the age of the last fix at each moment, and whether there was one; it counts from the start before."""
+    fixes_s = time_s[is_fix]
+    last = np.searchsorted(fixes_s, moments, side="right") - 1
+    known = last >= 0
+    return moments - np.where(known, fixes_s[np.maximum(last, 0)] if len(fixes_s) else 0.0, time_s[0]), known
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.9])
+def test_ages_availability_and_continuity_are_those_of_moments_close_together(seed, share):
+    rng = np.random.default_rng(seed)
+    time_s = np.cumsum(rng.uniform(2.0, 20.0, 60))
+    is_fix = rng.random(60) < share
+    is_fix[30:40] = False
+    moments = np.linspace(time_s[0], time_s[-1], 200_001)[:-1]
+    age_s, known = ages_at(time_s, is_fix, moments)
+    holds = known & (age_s <= 30.0)
+    assert age_quantile(time_s, is_fix) == pytest.approx(np.quantile(age_s, 0.95), abs=0.05)
+    assert availability(time_s, is_fix, 30.0) == pytest.approx(holds.mean(), abs=1e-3)
+    step_s = moments[1] - moments[0]
+    ahead = round(60.0 / step_s)
+    ends = np.cumsum(~holds)
+    lasts = holds[:-ahead] & (ends[ahead:] == ends[:-ahead])
+    expected = lasts.sum() / max(1, holds[:-ahead].sum())
+    assert continuity(time_s, is_fix, 30.0, 60.0) == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_flight_without_a_fix_is_as_old_as_it_is_long_and_one_after_another_gives_ages_right_or_not():
+    heads, truths = a_flight(21)  # 2 km, 200 s
+    row = score_of(heads, truths, answers(truths, accepted=[False] * 21))
+    assert (row["fix_age_longest_s"], row["fix_age_longest_m"], row["duration_s"]) == (200.0, 2000.0, 200.0)
+    assert (row["fix_age_p95_s"], row["fix_age_p95_m"]) == (pytest.approx(190.0), pytest.approx(1900.0))
+    assert (row["available_30s"], row["continuity_60s"]) == (0.0, 0.0)
+    row = score_of(heads, truths, answers(truths, off_m=[400.0] * 21))  # false, but accepted
+    assert (row["fix_age_longest_s"], row["available_30s"], row["continuity_60s"]) == (10.0, 1.0, 1.0)
+    assert row["longest_without_fix_m"] == 2000.0
+    row = score_of(heads, truths, answers(truths, accepted=[at == 5 for at in range(21)]))
+    assert (row["fix_age_longest_s"], row["available_30s"], row["continuity_60s"]) == (150.0, 0.15, 0.0)
+
+
+def test_continuity_counts_no_flight_that_is_shorter_than_its_window_and_a_miss_of_any_other():
+    (metric,) = (one for one in means_of("sequence") if one.name == "continuity_60s")
+    rows = [
+        score_of(*flight, answers(flight[1], accepted=[False] * len(flight[1])))
+        for flight in (a_flight(6, "f0"), a_flight(11, "f1"))  # 50 s and 100 s
+    ]
+    table = pd.DataFrame(rows)
+    assert metric.counts(table).tolist() == [False, True]
+    assert metric.values(table)[1] == 0.0
+
+
+def test_the_band_of_nees_is_that_of_one_view_and_takes_no_covariance_for_a_fault():
+    squares = np.random.default_rng(0).chisquare(3, 200_000) / 3
+    inside = (squares >= NEES_BAND[0]) & (squares <= NEES_BAND[1])
+    assert inside.mean() == pytest.approx(0.95, abs=2e-3)
+    heads, truths = a_flight()
+    honest = score_of(heads, truths, answers(truths, off_m=[5.0, -5.0] * 5 + [5.0]))  # 1 of 3 degrees of freedom
+    assert (honest["nees"], honest["nees_in_band"]) == (pytest.approx(1 / 3), True)
+    assert score_of(heads, truths, answers(truths, off_m=[20.0] * 11))["nees_in_band"] is False
+    assert score_of(heads, truths, answers(truths, covariance=None))["nees_in_band"] is False
+
+
+def test_a_fix_is_confirmed_by_two_accepted_ones_before_it_that_agree_by_the_odometer():
+    heads, truths = a_flight(12)
+    off_m = [400.0, 0.0, 0.0, 0.0, 0.0, 400.0, 400.0, 400.0, 0.0, 20.0, 40.0, 65.1]
+    row = score_of(heads, truths, answers(truths, off_m=off_m))
+    # Views 3 and 4 close a row of three; 7 one of false fixes; 10 one that creeps away, and 11 is too far from 10.
+    assert row["right_confirmed"] == pytest.approx(2 / 12)
+    assert row["false_confirmed"] == pytest.approx(2 / 12)
+    assert row["false_of_confirmed"] == 0.5
+    assert (row["first_fix_m"], row["first_confirmed_m"]) == (100.0, 300.0)
+
+
+def test_fixes_that_are_not_accepted_in_between_break_no_row_and_an_odometer_that_is_lost_does():
+    heads, truths = a_flight(9)
+    accepted = [at not in (1, 4) for at in range(9)]
+    row = score_of(heads, truths, answers(truths, accepted=accepted))
+    assert row["right_confirmed"] == pytest.approx(5 / 9)  # 3, 5, 6, 7, 8
+    lost = [replace(head, increment=None) if head.frame == 5 else head for head in heads]
+    row = score_of(lost, truths, answers(truths, accepted=accepted))
+    assert row["right_confirmed"] == pytest.approx(3 / 9)  # 3, 7, 8
+    hover, same = a_flight(9, steps_m=[100.0] * 4 + [0.0] + [100.0] * 3)
+    assert score_of(hover, same, answers(same))["right_confirmed"] == pytest.approx(7 / 9)
+    lost = [replace(head, increment=None) if head.frame == 5 else head for head in hover]
+    assert score_of(lost, same, answers(same))["right_confirmed"] == pytest.approx(5 / 9)  # 2, 3, 4, 7, 8
+    few = score_of(heads, truths, answers(truths, accepted=[at < 2 for at in range(9)]))
+    assert (few["right_confirmed"], few["first_confirmed_m"]) == (0.0, math.inf)
+    turned = a_flight(6)
+    row = score_of(turned[0], turned[1], answers(turned[1]))
+    assert row["right_confirmed"] == pytest.approx(4 / 6)
+    odd = {
+        name: replace(one, candidates=((replace(one.candidates[0][0], yaw_deg=0.0), 1.0),))
+        for name, one in answers(turned[1]).items()
+    }
+    assert score_of(turned[0], turned[1], odd)["right_confirmed"] == 0.0  # its heading leads the odometer astray

@@ -8,7 +8,7 @@ import pytest
 
 from sasgeo_bench.scoring.decisions import Fixes, augrc, aurc, excess_aurc
 from sasgeo_bench.scoring.metric import MeanMetric
-from sasgeo_bench.scoring.metrics import METRICS, REJECTION, means_of, primary_of, quantiles_of
+from sasgeo_bench.scoring.metrics import METRICS, REJECTION, means_of, primary_of, quantiles_of, within_metric
 from sasgeo_bench.tasks.query import TRUTH_SIGMA
 from tests.scoring.test_tables import scores
 
@@ -39,11 +39,24 @@ def test_means_compute_what_they_are_named_after():
     assert all(isinstance(metric, MeanMetric) for metric in means_of("retrieval"))
 
 
+def test_places_and_headings_are_also_counted_by_themselves_and_an_answer_that_is_missing_is_beyond():
+    errors_deg = [180.0, 5.0, 0.0, 5.1, math.inf]
+    table = scores([5.0, 7.0, 20.0, 4.0, math.inf]).assign(yaw_error_deg=errors_deg)
+    found = {metric.name: metric.values(table).tolist() for metric in means_of("localization")}
+    assert found["within_5m"] == [1.0, 0.0, 0.0, 1.0, 0.0]
+    assert found["within_10m"] == [1.0, 1.0, 0.0, 1.0, 0.0]
+    assert found["within_5deg"] == [0.0, 1.0, 1.0, 0.0, 0.0]
+    assert found["within_25m"] == [1.0, 1.0, 1.0, 1.0, 0.0]
+    both = within_metric(10.0, 5.0)
+    assert (both.name, both.values(table).tolist()) == ("success_10m", found["success_10m"])
+
+
 def test_success_is_not_scored_within_less_than_two_deviations_of_the_truth():
     table = scores([1.0, 7.0, 20.0]).assign(strength=[2.0, 5.0, 2.0], strength_unit=["views", TRUTH_SIGMA, TRUTH_SIGMA])
     counts = {metric.name: metric.counts(table).tolist() for metric in means_of("localization")}
     assert counts["success_25m"] == counts["success_10m"] == [True, True, True]  # 10 m are two of 5 m
-    assert counts["success_5m"] == [True, False, True]
+    assert counts["success_5m"] == counts["within_5m"] == [True, False, True]
+    assert counts["within_5deg"] == [True, True, True]
     table = table.assign(strength=[2.0, 20.0, 5.1])
     counts = {metric.name: metric.counts(table).tolist() for metric in means_of("localization")}
     assert (counts["success_25m"], counts["success_10m"]) == ([True, False, True], [True, False, False])

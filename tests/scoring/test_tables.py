@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sasgeo_bench.boards.board_tables import Book, summary
+from sasgeo_bench.boards.board_tables import Book, summary, use_table
 from sasgeo_bench.boards.manifests import BoardManifest
 from sasgeo_bench.boards.tables import text_of
 from sasgeo_bench.boards.text import MARKDOWN, Contents, board_latex, board_markdown, rows_of, warnings_of
@@ -116,8 +116,20 @@ def test_a_fix_that_is_near_and_turned_is_no_success_and_yet_within():
     board = leaderboard({"mine": table}, draws=200)
     assert pick(board, "mine", "success_25m")["value"] == 0.25
     assert pick(board, "mine", "within_25m")["value"] == 0.75 == table["is_right"].mean()
-    (shown,) = rows_of(Contents(leaderboard=board), MARKDOWN)
+    shown, used = rows_of(Contents(leaderboard=board), MARKDOWN)
     assert column_of(shown, "within_25m")[0].startswith("0.750 [")
+    assert column_of(used, "within_5deg")[0].startswith("0.500 [")
+
+
+def test_errors_are_shown_under_the_names_of_the_field_and_a_scale_in_per_cent():
+    table = scores([1.0, 4.0, 30.0, math.inf] * 10, log_scale_error=[0.01, 0.02, 0.03, math.inf] * 10)
+    board = leaderboard({"mine": table, "random": table}, draws=200)
+    shown = use_table(Book.of(board), ("occlusion", "localization", "r500-weak-s3"))
+    assert [row.cells[0].text for row in shown.rows] == ["mine", "random"]
+    texts = dict(zip((column.name for column in shown.columns), map(text_of, shown.rows[0].cells), strict=True))
+    assert texts["R@5 m"].startswith("0.500 [")
+    assert texts["R95 (m)"].startswith("inf [")
+    assert texts["median scale error (%)"].startswith("2.000 [")
 
 
 def test_recall_counts_ties_in_proportion():
@@ -225,7 +237,7 @@ def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():
         assert ranks(mine) == ranks(before)
         assert mine["detectable"] == before["detectable"]
     values = {name: EntryLabel("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
-    first, apart = rows_of(Contents(leaderboard=with_entry_labels(board, values)), MARKDOWN)
+    first, apart, _ = rows_of(Contents(leaderboard=with_entry_labels(board, values)), MARKDOWN)
     assert set(column_of(first, "matcher")) == {"good (as submitted)", "bad (as submitted)"}
     assert column_of(apart, "matcher") == ["best (as submitted) (set apart)"]
     assert apart.notes == ("best: for a reason.",)
@@ -351,7 +363,7 @@ def test_no_name_breaks_a_table():
     name = r"mine 1|2 <b> \$ {x} ~ ^"
     board = leaderboard({name: scores([1.0, 99.0])}, draws=200)
     lines = board_markdown(ABOUT, Contents(leaderboard=board)).splitlines()
-    (at,) = (at for at, line in enumerate(lines) if "mine 1" in line)
+    at, _ = (at for at, line in enumerate(lines) if "mine 1" in line)
     assert r"mine 1\|2 &lt;b>" in lines[at]
     assert lines[at].replace(r"\|", "").count("|") == lines[at - 1].count("|")  # of the rule below the head
     assert "[U+2122]" in board_latex(

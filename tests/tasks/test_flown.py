@@ -30,13 +30,15 @@ def corners(root, *, along=0.6):
     return np.stack([x, y], axis=1)
 
 
-def log_of(path, en_m, epsg, *, speed_mps=10.0):
-    """Write a table of a flight along corners, a point a second."""
+def log_of(path, en_m, epsg, *, speed_mps=10.0, start=None):
+    """Write a table of a flight along corners, a point a second; with dates from a start on, by UTC."""
     way = shapely.LineString(en_m)
     points = shapely.get_coordinates(shapely.line_interpolate_point(way, np.arange(0, way.length, speed_mps)))
     lon, lat = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True).transform(*points.T)
-    rows = [f"{second},{y:.8f},{x:.8f},90.0" for second, (x, y) in enumerate(zip(lon, lat, strict=True))]
-    path.write_text("\n".join(["time_s,lat,lon,height_m", *rows]) + "\n", encoding="ascii")
+    times = range(len(lon)) if start is None else np.datetime64(start) + np.arange(len(lon))
+    rows = [f"{time},{y:.8f},{x:.8f},90.0" for time, x, y in zip(times, lon, lat, strict=True)]
+    column = "time_s" if start is None else "time_utc"
+    path.write_text("\n".join([f"{column},lat,lon,height_m", *rows]) + "\n", encoding="ascii")
     return path
 
 
@@ -66,6 +68,25 @@ def test_the_views_lie_along_the_log_in_its_order_and_head_where_it_flies(root, 
         if np.abs(at_m - np.append(0.0, legs)).min() > 15.0:  # farther from a corner than its course is measured over
             expected = (90.0, 0.0, 270.0)[leg]
             assert abs((pose.yaw_deg - expected + 180) % 360 - 180) < 2.0
+
+
+def test_a_log_that_tells_the_date_tells_when_each_view_was_flown(root, tmp_path):
+    epsg, way_m = read_manifest(root / "regions" / TOWN).epsg, corners(root)
+    log = log_of(tmp_path / "log.csv", way_m, epsg, start="2025-05-01T10:00:00")
+    make_tasks(request_of(root, flown=FlownPath(file=log)))
+    truths = list(read_truths(root / "truth" / "flight-clean" / TOWN))
+    way = shapely.LineString(way_m)
+    assert truths
+    for truth in truths:
+        seconds = truth.measured["utc_s"] - 1_746_093_600
+        at = way.interpolate(10.0 * seconds)  # where the log is then
+        assert at.distance(shapely.Point(truth.pose.easting_m, truth.pose.northing_m)) < 5.0
+
+
+def test_a_log_without_a_date_tells_no_utc(root, tmp_path):
+    epsg = read_manifest(root / "regions" / TOWN).epsg
+    make_tasks(request_of(root, flown=FlownPath(file=log_of(tmp_path / "log.csv", corners(root), epsg))))
+    assert not any("utc_s" in truth.measured for truth in read_truths(root / "truth" / "flight-clean" / TOWN))
 
 
 def test_a_flight_is_drawn_anew_when_its_log_or_its_height_changes(root, tmp_path):

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses of photos by the log of the flight on which they were taken, joined by time."""
+
+import datetime as dt
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+from sasgeo_bench.core.errors import FlightError, PoseError, SasgeoError, counted, named
+from sasgeo_bench.core.texts import plain
+from sasgeo_bench.flights.log_points import AltitudeOf as LogAltitudeOf
+from sasgeo_bench.observing.picture_poses import AltitudeOf, PicturePose, PoseTable
+from sasgeo_bench.observing.tracks import Moment, Track, read_track
+from sasgeo_bench.sensing.photos import Photo, read_photo
+
+_ALTITUDES: Final[Mapping[LogAltitudeOf, AltitudeOf]] = MappingProxyType(
+    {"geoid": "sea", "ellipsoid": "ellipsoid", "unknown": "unstated"}
+)
+
+
+def poses_by_log(log: Path, photos: Mapping[str, Path], *, offset_s: float | None = None) -> PoseTable:
+    """Return where photos were when they were taken, by a log; interpolated between its points.
+
+    Parameters
+    ----------
+    log : Path
+        As `import-flight` reads it; names of a table say its units.
+    photos : mapping of str to Path
+        Files by the names by which they are known.
+    offset_s : float, optional
+        Seconds of the log at which the first photo was taken. Without it the clocks must be known: the zone of the
+        photos (EXIF's OffsetTimeOriginal), and UTC of the log.
+
+    Returns
+    -------
+    PoseTable
+        A photo without a time, before or after the log, or in a gap of it is left out. One that says how its camera
+        stood keeps that; others look straight down, their up as the log's drone heads.
+
+    Raises
+    ------
+    FlightError
+        If the log is not sound, or nothing says how the clocks go together.
+    PoseError
+        If no photo was taken while the log ran.
+    """
+    track = read_track(log)
+    if not track.has_own_clock:
+        raise FlightError(f"{plain(log.name)} counts from the begin of a video: name a log")
+    left_out: defaultdict[str, list[str]] = defaultdict(list)
+    taken: dict[str, Photo] = {}
+    for name, path in photos.items():
+        try:
+            photo = read_photo(path)
+        except SasgeoError:
+            left_out["that cannot be read"].append(name)
+            continue
+        if photo.taken_at is None:
+            left_out["that does not say when it was taken"].append(name)
+        else:
+            taken[name] = photo
+    times_s = _in_log(track, taken, offset_s)
+    poses = []
+    for name, time_s in times_s.items():
+        moment = track.at(time_s)
+        if isinstance(moment, str):
+            left_out[moment].append(name)
+        else:
+            has_gimbal = taken[name].gimbal is not None
+            poses.append(_pose(name, replace(moment, camera=None) if has_gimbal else moment, track, time_s))
+    if not poses:
+        why = "; ".join(f"{named([plain(name) for name in names], 'photo')} {why}" for why, names in left_out.items())
+        mend = "" if offset_s is not None else ": if a clock is wrong, say --offset"
+        raise PoseError(f"no photo was taken while {plain(log.name)} ran ({why}){mend}")
+    first = min(times_s.values())
+    how = "as --offset says" if offset_s is not None else "by UTC of both"
+    notes = (
+        f"the first of {counted(len(times_s), 'photo')} was taken {first:.1f} s after the log begins, {how}",
+        *track.notes,
+    )
+    out = {why: tuple(names) for why, names in left_out.items()}
+    return PoseTable(path=log, kind="flight log", poses=tuple(poses), left_out=out, notes=notes)
+
+
+def _in_log(track: Track, taken: Mapping[str, Photo], offset_s: float | None) -> dict[str, float]:
+    """Return when photos were taken by the clock of a log."""
+    clock_s = {name: _seconds(photo) for name, photo in taken.items()}
+    if not clock_s:
+        return {}
+    if offset_s is not None:
+        first_s = min(clock_s.values())
+        return {name: offset_s + (seconds - first_s) for name, seconds in clock_s.items()}
+    start_s = track.log.start_s
+    without = [name for name, photo in taken.items() if photo.utc_offset is None]
+    lacks = []
+    if without:
+        lacks.append(f"{named([plain(name) for name in without], 'photo')} without the zone of the clock")
+    if start_s is None:
+        lacks.append(f"{plain(track.path.name)} does not say UTC")
+    if start_s is None or without:
+        raise FlightError(f"{', and '.join(lacks)}: say --offset, the seconds of the log at the first photo")
+    ahead_s = {name: photo.utc_offset.total_seconds() for name, photo in taken.items() if photo.utc_offset is not None}
+    return {name: clock_s[name] - ahead_s[name] - start_s for name in ahead_s}
+
+
+def _seconds(photo: Photo) -> float:
+    assert photo.taken_at is not None  # noqa: S101 - others are left out
+    return photo.taken_at.replace(tzinfo=dt.UTC).timestamp()
+
+
+def _pose(name: str, moment: Moment, track: Track, time_s: float) -> PicturePose:
+    log = track.log
+    return PicturePose(
+        name=name,
+        place=moment.lonlat,
+        height_m=moment.height_m,
+        altitude_m=moment.altitude_m,
+        altitude_of=_ALTITUDES[log.altitude_of],
+        attitude=moment.camera,
+        time_s=time_s if log.start_s is None else log.start_s + time_s,
+        clock="own" if log.start_s is None else "utc",
+        sigma_m=track.sigma_m,
+    )

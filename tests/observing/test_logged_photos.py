@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photos get their poses from the log of their flight: joined by UTC, or by the second of the log that is stated."""
+
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+
+from sasgeo_bench.core.errors import ConfigError, FlightError, PoseError
+from sasgeo_bench.observing.import_photos import ImportRequest
+from sasgeo_bench.observing.logged_photos import poses_by_log
+from tests.sensing.test_photos import xmp_of
+
+LON, LAT, STEP = 9.52, 47.14, 1e-4
+
+
+def log_of(path, *, gap=(), clock="2025-05-01T10:00:{:06.3f}Z"):
+    """A flight to the north with a point a second, 40 of them, that turns by a degree a second and climbs."""
+    rows = [
+        f"{clock.format(at)},{LAT + at * STEP:.7f},{LON},{80 + at},{300 + at},{(350 + at) % 360}"
+        for at in range(40)
+        if at not in gap
+    ]
+    path.write_text("\n".join(["time,lat,lon,height_agl_m,alt_m,heading_deg", *rows]) + "\n", encoding="ascii")
+    return path
+
+
+def photo(path, time, *, offset="+02:00", part="", xmp=b""):
+    exif = Image.Exif()
+    inner = exif.get_ifd(ExifTags.IFD.Exif)
+    if time:
+        inner[ExifTags.Base.DateTimeOriginal] = time
+    if offset:
+        inner[ExifTags.Base.OffsetTimeOriginal] = offset
+    if part:
+        inner[ExifTags.Base.SubsecTimeOriginal] = part
+    Image.new("L", (40, 30)).save(path, format="JPEG", exif=exif, **({"xmp": xmp} if xmp else {}))
+    return path
+
+
+def test_a_photo_lies_between_the_points_of_the_log_at_its_own_moment(tmp_path):
+    log = log_of(tmp_path / "log.csv")
+    found = {
+        "a": photo(tmp_path / "a.jpg", "2025:05:01 12:00:12", part="25"),
+        "b": photo(tmp_path / "b.jpg", "2025:05:01 05:30:20", offset="-04:30"),
+    }
+    table = poses_by_log(log, found)
+    for pose, second in zip(table.poses, (12.25, 20.0), strict=True):
+        assert pose.place == pytest.approx((LON, LAT + second * STEP), abs=1e-7)
+        assert pose.height_m == pytest.approx(80 + second)
+        assert pose.height_of == "take-off"
+        # 350 degrees and more: past north the short way
+        assert pose.attitude.yaw_deg % 360 == pytest.approx((350 + second) % 360)
+        assert pose.tilt_deg == pytest.approx(0, abs=1e-4)
+        assert pose.time_s == pytest.approx(1746093600 + second)
+    assert "12.2 s after the log begins, by UTC of both" in table.notes[0]
+
+
+def test_an_offset_is_the_second_of_the_log_at_the_first_photo_whatever_the_clocks_say(tmp_path):
+    log = log_of(tmp_path / "log.csv")
+    late, early = (photo(tmp_path / f"{at}.jpg", f"1999:01:01 00:00:0{at}", offset="") for at in (7, 2))
+    found = {"b": late, "a": early}
+    with pytest.raises(FlightError, match=r"2 photos \(b, a\) without the zone of the clock: say --offset"):
+        poses_by_log(log, found)
+    places = {pose.name: pose.place[1] for pose in poses_by_log(log, found, offset_s=10.0).poses}
+    assert places == pytest.approx({"a": LAT + 10 * STEP, "b": LAT + 15 * STEP}, abs=1e-7)
+
+
+def test_photos_that_the_log_does_not_tell_are_left_out_with_the_reason(tmp_path):
+    log = log_of(tmp_path / "log.csv", gap=range(15, 30))
+    (tmp_path / "broken.jpg").write_text("no photo")
+    found = {
+        "good": photo(tmp_path / "good.jpg", "2025:05:01 12:00:05"),
+        "early": photo(tmp_path / "early.jpg", "2025:05:01 11:59:00"),
+        "gap": photo(tmp_path / "gap.jpg", "2025:05:01 12:00:22"),
+        "timeless": photo(tmp_path / "timeless.jpg", ""),
+        "broken": tmp_path / "broken.jpg",
+    }
+    table = poses_by_log(log, found)
+    assert [pose.name for pose in table.poses] == ["good"]
+    assert table.left_out == {
+        "that the track does not cover": ("early",),
+        "in a gap of more than 10 s of the track": ("gap",),
+        "that does not say when it was taken": ("timeless",),
+        "that cannot be read": ("broken",),
+    }
+    with pytest.raises(PoseError, match=r"no photo was taken while log.csv ran .*: if a clock is wrong, say --offset"):
+        poses_by_log(log, {"early": found["early"]})
+
+
+def test_the_gimbal_of_a_photo_goes_before_the_body_of_the_drone(tmp_path):
+    log = log_of(tmp_path / "log.csv")
+    told = xmp_of({"GimbalYawDegree": "33", "GimbalPitchDegree": "-80", "GimbalRollDegree": "0"}).encode()
+    found = {"a": photo(tmp_path / "a.jpg", "2025:05:01 12:00:05", xmp=told)}
+    assert poses_by_log(log, found).poses[0].attitude is None  # the photo's own is kept
+
+
+def test_a_log_that_does_not_say_utc_needs_an_offset_and_a_table_beside_it_is_refused(tmp_path):
+    log = log_of(tmp_path / "log.csv", clock="{:.3f}")
+    log.write_text(log.read_text().replace("time,", "time_s,"))
+    found = {"a": photo(tmp_path / "a.jpg", "2025:05:01 12:00:05")}
+    with pytest.raises(FlightError, match=r"log\.csv does not say UTC: say --offset"):
+        poses_by_log(log, found)
+    assert np.isclose(poses_by_log(log, found, offset_s=3.0).poses[0].place[1], LAT + 3 * STEP)
+    with pytest.raises(ConfigError, match="give --poses or --track alone"):
+        ImportRequest(pictures=tmp_path, region=tmp_path, out=tmp_path, poses=log, log=log)

@@ -13,7 +13,6 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.boards.run_cases import read_run_cases
 from sasgeo_bench.cli.console import print_table, said_after, say
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, OwnRegionFolders, takes
 from sasgeo_bench.core.errors import FlightError, counted
@@ -30,10 +29,8 @@ from sasgeo_bench.flights.plans import MARGIN_M
 from sasgeo_bench.flights.trajectory import Axes, Trajectory, read_tum, write_tum
 from sasgeo_bench.regions.region_files import MANIFEST, read_manifest, read_region
 from sasgeo_bench.scoring.gnss_check import IN_A_ROW, SHARE, SIGMA_M, Monitor, check_gnss, summary
-from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import TRUTH_SIGMA, PriorGroup
 from sasgeo_bench.tasks.task_files import Task
-from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 
 AxesFlag = Annotated[
     Axes | None,
@@ -153,6 +150,10 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
             for line in _lines(log, options.speed_mps or SPEED_MPS):
                 options.say(line)
         return ()
+    # Half a second, which who only asks what a log holds need not wait for.
+    from sasgeo_bench.tasks.build import make_tasks  # noqa: PLC0415
+    from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests  # noqa: PLC0415
+
     flown = options.flown
     built = Path(options.region, MANIFEST)
     wanted = TaskRequest(
@@ -201,6 +202,8 @@ class GnssOptions(Options):
 
 def check_gnss_command(options: GnssOptions) -> None:
     """Say how soon fixes on the map notice that a receiver is led astray, and how often they are wrong about it."""
+    from sasgeo_bench.boards.run_cases import read_run_cases  # noqa: PLC0415 - a second, as above
+
     monitor = Monitor(sigma_m=options.sigma, in_a_row=options.in_a_row)
     speeds_mps = _positive(options.pull_off, "--pull-off", "0.5,2", "metres a second")
     cases = read_run_cases(options.run, out=options.out, split=None)
@@ -247,7 +250,7 @@ class DriftOptions(Options):
 
     logs: Annotated[
         list[Path] | None,
-        typer.Argument(help="logs: ULog, DataFlash, .tlog, bags of PX4; instead of --truth and --estimate"),
+        typer.Argument(help="logs: ULog, DataFlash, .tlog, bags; instead of --truth and --estimate"),
     ] = None
     truth: Annotated[
         list[Path] | None, typer.Option(help="true trajectory, TUM format, plain or gzipped; may be repeated")
@@ -262,6 +265,7 @@ class DriftOptions(Options):
     lost_s: Annotated[float, typer.Option(min=0, help="seconds without a pose that are a lost stretch")] = LOST_S
     axes: AxesFlag = None
     vehicle: VehicleFlag = None
+    topic: Annotated[str | None, typer.Option(help="topic of a bag with poses that fused no GNSS")] = None
     results: Annotated[Path | None, typer.Option(help="also write the figures into this Parquet file")] = None
     profile: Annotated[Path | None, typer.Option(help="also write a profile that was fitted, a TOML file")] = None
 
@@ -282,8 +286,8 @@ def measure_drift_command(drift: DriftOptions) -> None:
         raise FlightError("say either logs, or --truth and --estimate: drift is measured of one of them")
     lengths = drift.lengths
     _check_outputs(drift.inputs, [path for path in (drift.results, drift.profile) if path is not None])
-    if drift.vehicle is not None and not drift.logs:
-        raise FlightError("TUM files are of one vehicle: leave out --vehicle")
+    if not drift.logs and (drift.vehicle, drift.topic) != (None, None):
+        raise FlightError("TUM files have neither vehicles nor topics: leave out --vehicle and --topic")
     if drift.logs:
         logged = _read_logs(drift)
         runs, has_yaw = (
@@ -315,7 +319,10 @@ def _read_logs(drift: DriftOptions) -> dict[Path, LoggedRuns]:
     """Read the odometry of logs, each once."""
     if drift.axes is not None:
         raise FlightError("logs have axes of their own: leave out --axes")
-    logged = {path: read_runs(path, lost_s=drift.lost_s, vehicle=drift.vehicle) for path in drift.logs or []}
+    logged = {
+        path: read_runs(path, lost_s=drift.lost_s, vehicle=drift.vehicle, topic=drift.topic)
+        for path in drift.logs or []
+    }
     if drift.profile is not None and not all(one.has_yaw for one in logged.values()):
         raise FlightError("a profile needs headings, and the log has none but the vehicle's: leave out --profile")
     return logged

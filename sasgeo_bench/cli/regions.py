@@ -175,6 +175,7 @@ class NewRegionOptions(Options):
     flight: Annotated[
         Path | None, typer.Option(help="log of a flight: the place is where it was flown, and 500 m around")
     ] = None
+    vehicle: Annotated[int | None, typer.Option(help="system id of the vehicle in a .tlog of several")] = None
     country: Annotated[str | None, typer.Option(help="country of the place, for its provenance and for splits")] = None
     date: Annotated[
         str | None, typer.Option(help="YYYY, YYYY-MM or YYYY-MM-DD: take the extract nearest to it; default: newest")
@@ -246,20 +247,22 @@ def _place(options: NewRegionOptions) -> "Place":
         raise ConfigError(
             "say where the region lies by --center LON,LAT and --size 2km, by --bounds, by --photos, or by --flight"
         )
+    if options.vehicle is not None and options.flight is None:
+        raise ConfigError("--vehicle tells which of several a log is of: give --flight, or leave it out")
     if options.center is not None:
         return Place.around(options.center, options.size or "")
     if options.bounds is not None:
         return Place.within(options.bounds)
     if options.flight is not None:
-        return Place.of_points(_flown_over(options.flight), noun="point")
+        return Place.of_points(_flown_over(options.flight, options.vehicle), noun="point")
     return Place.of_points(_taken_at(options.photos or Path()))
 
 
-def _flown_over(log: Path) -> NDArray[np.float64]:
+def _flown_over(log: Path, vehicle: int | None) -> NDArray[np.float64]:
     """Return longitude and latitude of points of a log, of a thousand or two at most."""
     from sasgeo_bench.flights.logs import read_places  # noqa: PLC0415 - as above
 
-    lonlat = read_places(log)
+    lonlat = read_places(log, vehicle=vehicle)
     return lonlat[:: max(1, len(lonlat) // 1000)]
 
 

@@ -23,11 +23,13 @@ from numpy.typing import NDArray
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.flights import log_ulog
-from sasgeo_bench.flights.log_points import FlightLog, LogSource
+from sasgeo_bench.flights.log_points import FlightLog, LogSource, listed, shown
 from sasgeo_bench.flights.log_streams import (
     MOST_LOG_BYTES,
     Clock,
+    Estimate,
     Fixes,
+    LoggedOdometry,
     Stream,
     Streams,
     first_with_fixes,
@@ -112,10 +114,74 @@ def read_bag(path: Path) -> FlightLog:
     return flight_of(bag.source, streams)
 
 
-def read_topics(path: Path, names: Collection[str]) -> log_ulog.Topics:
-    """Read PX4's own messages of a bag, as `log_ulog.read_topics` reads a ULog; raise as `read_bag` does."""
-    with _opened(path) as bag:
-        return _px4_topics(bag, names)
+def read_odometry(path: Path, *, topic: str | None = None) -> LoggedOdometry:
+    """Read the odometry of a bag.
+
+    Parameters
+    ----------
+    path : Path
+        As `read_bag` takes it.
+    topic : str, optional
+        Topic of `nav_msgs/Odometry`, `PoseStamped` or `PoseWithCovarianceStamped`, of a body with its axes forward,
+        left, up. By default what PX4's own messages say, as of a ULog.
+
+    Returns
+    -------
+    LoggedOdometry
+        With the fixes of a `NavSatFix` and the attitudes of mavros, unless all is of PX4.
+
+    Raises
+    ------
+    ConfigError
+        If rosbags is not installed.
+    FlightError
+        As `read_bag`; if there is no such topic, none is named of a bag without PX4's messages, or its name says that
+        it fused a receiver.
+    """
+    with _opened(path) as bag, known_fields(bag.source):
+        if topic is None:
+            topics = _px4_topics(bag, log_ulog.OF_DRIFT)
+            if any(name in log_ulog.PLACES for name, _ in topics.topics):
+                return log_ulog.odometry_of(topics)
+        poses = {one.topic: one for one in bag.connections(_POSES)}
+        if topic not in poses:
+            there = f"one of {listed(list(poses))}, if it fused no GNSS" if poses else "of poses, of which it has none"
+            why = "no bag says of poses whether they fused GNSS" if topic is None else f"has no poses on {shown(topic)}"
+            raise bag.source.fault(f"{why}: say --topic, {there}")
+        if topic.endswith(_FUSED_POSES):
+            raise bag.source.fault(
+                f"{topic} is what the autopilot or a filter made of the receiver: a copy of the truth, and no odometry"
+            )
+        places = _RosPlaces.of(bag)
+        if places.fixes.is_estimate:
+            raise bag.source.fault(f"{places.fixes.track.name} is an estimate, and no truth: log a NavSatFix")
+        table = bag.table(poses[topic], [f"{_POSES[poses[topic].msgtype]}.{name}" for name in _POSE_FIELDS])
+        east, north, up, *turns = table.values.T
+        values = np.column_stack([north, east, -up, quaternions_of_enu(*turns)])
+        stream = Stream.of(bag.source, topic, places.clock.seconds(table), values)
+        estimate = Estimate(poses=stream, fused="as --topic says")
+        return LoggedOdometry.of(
+            bag.source,
+            (places.fixes, places.notes),
+            [estimate],
+            _attitudes(bag, places.clock),
+            (places.clock.note,),
+        )
+
+
+_POSES: Final = MappingProxyType(
+    {
+        "nav_msgs/msg/Odometry": "pose.pose",
+        "geometry_msgs/msg/PoseStamped": "pose",
+        "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
+    }
+)
+_POSE_FIELDS: Final = (*(f"position.{axis}" for axis in "xyz"), *(f"orientation.{axis}" for axis in "wxyz"))
+# Ends of topics of mavros and robot_localization that have fused a receiver, or may have.
+_FUSED_POSES: Final = (
+    *("local_position/pose", "local_position/pose_cov", "local_position/odom", "global_position/local", "odometry/in"),
+    *("odometry/filtered", "odometry/filtered_map", "odometry/global", "odometry/gps"),
+)
 
 
 @contextmanager
@@ -252,28 +318,42 @@ def _spread(names: Sequence[str]) -> list[str]:
 # ROS
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _RosPlaces:
+    """Fixes of the topic that is read, a note on the others, and its clock."""
+
+    fixes: Fixes
+    notes: tuple[str, ...]
+    clock: "_RosClock"
+
+    @classmethod
+    def of(cls, bag: _Bag) -> "_RosPlaces":
+        """Return the first topic with two fixes: of a receiver that with most messages, else of an estimator."""
+        raw = [bag.table(one, _FIX_FIELDS) for one in bag.connections([_FIX])]
+        tables: list[tuple[_Table, _Maker]] = [(one, _fixes_of_ros) for one in raw if not one.name.endswith(_FUSED)]
+        tables += [(bag.table(one, _PLACE_FIELDS), _places_of_ros) for one in bag.connections([_LOCATION])]
+        tables.sort(key=lambda pair: -len(pair[0].recorded_ns))
+        estimated = partial(_fixes_of_ros, is_estimate=True)
+        tables += [(one, estimated) for one in raw if one.name.endswith(_FUSED)]
+        for one in bag.connections(_GEOGRAPHIC):
+            paths = [f"{_GEOGRAPHIC[one.msgtype]}.{name}" for name in _PLACE_FIELDS]
+            tables.append((bag.table(one, paths), partial(_places_of_ros, is_estimate=True)))
+        clocks = {table.name: _RosClock.of(table) for table, _ in tables}
+        found = [make(bag.source, table, clocks[table.name].seconds(table)) for table, make in tables]
+        what = f"NavSatFix, LocationFix, geographic_msgs or {_PX4.partition('/')[0]}"
+        fixes, notes = first_with_fixes(bag.source, found, what)
+        return cls(fixes=fixes, notes=notes, clock=clocks[fixes.track.name])
+
+
 def _ros_streams(bag: _Bag) -> Streams:
     """Return what messages of ROS say."""
-    raw = [bag.table(one, _FIX_FIELDS) for one in bag.connections([_FIX])]
-    tables: list[tuple[_Table, _Maker]] = [(one, _fixes_of_ros) for one in raw if not one.name.endswith(_FUSED)]
-    tables += [(bag.table(one, _PLACE_FIELDS), _places_of_ros) for one in bag.connections([_LOCATION])]
-    tables.sort(key=lambda pair: -len(pair[0].recorded_ns))
-    fused: list[tuple[_Table, _Maker]] = [
-        (one, partial(_fixes_of_ros, is_estimate=True)) for one in raw if one.name.endswith(_FUSED)
-    ]
-    for one in bag.connections(_GEOGRAPHIC):
-        paths = [f"{_GEOGRAPHIC[one.msgtype]}.{name}" for name in _PLACE_FIELDS]
-        fused.append((bag.table(one, paths), partial(_places_of_ros, is_estimate=True)))
-    clocks = {table.name: _RosClock.of(table) for table, _ in (*tables, *fused)}
-    candidates = [make(bag.source, table, clocks[table.name].seconds(table)) for table, make in (*tables, *fused)]
-    fixes, notes = first_with_fixes(bag.source, candidates, f"NavSatFix, LocationFix, geographic_msgs or {_PX4[:-5]}")
-    clock = clocks[fixes.track.name]
+    places = _RosPlaces.of(bag)
     return Streams(
-        fixes=fixes,
-        heights=_heights(bag, clock),
-        attitudes=_attitudes(bag, clock),
-        clock=clock.utc(fixes.track),
-        notes=(*notes, clock.note),
+        fixes=places.fixes,
+        heights=_heights(bag, places.clock),
+        attitudes=_attitudes(bag, places.clock),
+        clock=places.clock.utc(places.fixes.track),
+        notes=(*places.notes, places.clock.note),
     )
 
 

@@ -27,6 +27,7 @@ from sasgeo_bench.flights.log_streams import (
     Clock,
     Estimate,
     Fixes,
+    LoggedOdometry,
     Stream,
     Streams,
     first_with_fixes,
@@ -284,6 +285,15 @@ def estimates_of(messages: Messages) -> list[Estimate]:
 def _is_fused(status: Floats) -> NDArray[np.bool_]:
     """Return whether a receiver is fused, or the estimate is held in place, which is no odometry either."""
     return np.asarray(status.astype(np.uint32) & (1 << _USING_GPS | 1 << _HELD)) > 0
+
+
+def read_odometry(path: Path) -> LoggedOdometry:
+    """Read the odometry of a DataFlash log; raise `FlightError` if it has none, or no fixes of a receiver."""
+    messages = read_messages(path, OF_DRIFT, FIELDS)
+    with known_fields(messages.source):
+        return LoggedOdometry.of(
+            messages.source, fixes_of(messages), estimates_of(messages), attitudes_of(messages), messages.notes
+        )
 
 
 def _check_sources(messages: Messages, name: str) -> None:

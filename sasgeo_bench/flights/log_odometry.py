@@ -7,8 +7,9 @@ logged.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -19,21 +20,19 @@ from scipy.spatial.transform import Rotation
 from sasgeo_bench.core.errors import FlightError, counted
 from sasgeo_bench.flights import log_bags, log_dataflash, log_telemetry, log_ulog
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, pair_run
-from sasgeo_bench.flights.log_points import LogSource
-from sasgeo_bench.flights.log_streams import (
-    NED_OF_ENU,
-    Estimate,
-    Fixes,
-    Stream,
-    known_fields,
-    turned_at,
-    without_unknown,
-)
+from sasgeo_bench.flights.log_streams import NED_OF_ENU, LoggedOdometry, Stream, turned_at
 from sasgeo_bench.flights.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
-SUFFIXES: Final = (".ulg", ".bin", ".log", ".tlog")  # and bags of PX4
+_READERS: Final = MappingProxyType(
+    {
+        ".ulg": log_ulog.read_odometry,
+        ".bin": log_dataflash.read_odometry,
+        ".log": log_dataflash.read_odometry,
+    }
+)
+_TELEMETRY: Final = ".tlog"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,17 +59,21 @@ class LoggedRuns:
     notes: tuple[str, ...]
 
 
-def read_runs(path: Path, *, lost_s: float = LOST_S, vehicle: int | None = None) -> LoggedRuns:
+def read_runs(
+    path: Path, *, lost_s: float = LOST_S, vehicle: int | None = None, topic: str | None = None
+) -> LoggedRuns:
     """Read the odometry of a log with the truth of its receiver.
 
     Parameters
     ----------
     path : Path
-        ULog, DataFlash, telemetry, or a bag with PX4's own messages.
+        ULog, DataFlash, telemetry, or a bag.
     lost_s : float
         As `drift.pair_run` takes it.
     vehicle : int, optional
         System id of the vehicle in telemetry of several.
+    topic : str, optional
+        Topic of a bag with poses that fused no receiver, which their type does not say.
 
     Returns
     -------
@@ -83,7 +86,7 @@ def read_runs(path: Path, *, lost_s: float = LOST_S, vehicle: int | None = None)
         If the log has no fixes of a receiver, no odometry, or none that fused no receiver; the message names what it
         has, and the flags that tell.
     """
-    log = _read(path, vehicle)
+    log = _read(path, vehicle, topic)
     poses = log.estimate.poses
     has_yaw = log.estimate.has_attitudes
     if log.attitudes is None and has_yaw:
@@ -104,88 +107,26 @@ def read_runs(path: Path, *, lost_s: float = LOST_S, vehicle: int | None = None)
     return LoggedRuns(runs=tuple(runs), has_yaw=has_yaw, accuracy_m=log.fixes.accuracy_m, notes=(*notes, *log.notes))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Log:
-    """What a log has of truth and of odometry."""
-
-    source: LogSource
-    fixes: Fixes
-    estimate: Estimate
-    attitudes: Stream | None
-    notes: tuple[str, ...]
-
-    @classmethod
-    def of(
-        cls,
-        source: LogSource,
-        fixes: tuple[Fixes, tuple[str, ...]],
-        estimates: Sequence[Estimate],
-        attitudes: Stream | None,
-        notes: tuple[str, ...],
-    ) -> "_Log":
-        """Return what a log has; raise `FlightError` if it has no odometry."""
-        truth, others = fixes
-        if not estimates:
-            raise source.fault("holds no odometry: neither poses of a camera nor those of the estimator are logged")
-        estimate = estimates[0]
-        poses = without_unknown(estimate.poses)
-        if poses is None:
-            raise source.fault(f"{estimate.poses.name} has no pose with a place and an attitude: log them")
-        return cls(
-            source=source,
-            fixes=truth,
-            estimate=replace(estimate, poses=poses),
-            attitudes=without_unknown(attitudes),
-            notes=(*others, *notes),
-        )
-
-
-def _read(path: Path, vehicle: int | None) -> _Log:
+def _read(path: Path, vehicle: int | None, topic: str | None) -> LoggedOdometry:
     suffix = path.suffix.lower()
-    if suffix == ".tlog":
-        telemetry = log_telemetry.read_telemetry(path, vehicle=vehicle)
-        return _Log.of(
-            telemetry.source,
-            log_telemetry.fixes_of(telemetry),
-            log_telemetry.estimates_of(telemetry),
-            log_telemetry.attitudes_of(telemetry),
-            telemetry.notes,
-        )
-    if vehicle is not None:
+    if topic is not None and not log_bags.is_bag(path):
+        raise FlightError(f"{path.name} is no bag: leave out --topic")
+    if vehicle is not None and suffix != _TELEMETRY:
         raise FlightError(f"{path.name} is no telemetry log: leave out --vehicle")
-    if suffix == ".ulg":
-        return _of_px4(log_ulog.read_topics(path, log_ulog.OF_DRIFT))
     if log_bags.is_bag(path):
-        return _of_px4(log_bags.read_topics(path, log_ulog.OF_DRIFT))
-    if suffix not in SUFFIXES:
-        bags = ", ".join(log_bags.BAGS)
+        return log_bags.read_odometry(path, topic=topic)
+    if suffix == _TELEMETRY:
+        return log_telemetry.read_odometry(path, vehicle=vehicle)
+    if suffix not in _READERS:
+        suffixes = ", ".join((*_READERS, _TELEMETRY, *log_bags.BAGS))
         raise FlightError(
-            f"{path.name or path} is no log with odometry that is read: {', '.join(SUFFIXES)} are, and bags of PX4 "
-            f"({bags}); trajectories in TUM files go by --truth and --estimate"
+            f"{path.name or path} is no log with odometry that is read: {suffixes} are; trajectories in TUM files go "
+            "by --truth and --estimate"
         )
-    messages = log_dataflash.read_messages(path, log_dataflash.OF_DRIFT, log_dataflash.FIELDS)
-    with known_fields(messages.source):
-        return _Log.of(
-            messages.source,
-            log_dataflash.fixes_of(messages),
-            log_dataflash.estimates_of(messages),
-            log_dataflash.attitudes_of(messages),
-            messages.notes,
-        )
+    return _READERS[suffix](path)
 
 
-def _of_px4(topics: log_ulog.Topics) -> _Log:
-    with known_fields(topics.source):
-        return _Log.of(
-            topics.source,
-            log_ulog.fixes_of(topics),
-            log_ulog.estimates_of(topics),
-            log_ulog.attitudes_of(topics),
-            topics.notes,
-        )
-
-
-def _why_none(log: _Log) -> str:
+def _why_none(log: LoggedOdometry) -> str:
     """Return why no stretch is left."""
     name, told = log.estimate.poses.name, log.estimate.fused
     if not log.estimate.free_s:
@@ -196,7 +137,7 @@ def _why_none(log: _Log) -> str:
     return f"{name} and {log.fixes.track.name} have no two moments in common while no GNSS was fused ({told})"
 
 
-def _stretches(log: _Log) -> Iterator[tuple[Trajectory, Trajectory]]:
+def _stretches(log: LoggedOdometry) -> Iterator[tuple[Trajectory, Trajectory]]:
     """Yield the truth and the estimate of each stretch, at the fixes within it."""
     track, poses = log.fixes.track, log.estimate.poses
     lon, lat, up = track.values.T

@@ -8,7 +8,7 @@ where the log has that: an estimate may be a copy of it, or drift. Everything el
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from io import StringIO
 from typing import Final
 
@@ -222,6 +222,55 @@ class Estimate:
     def has_attitudes(self) -> bool:
         """Return whether the estimate has attitudes of its own."""
         return bool(self.poses.values.shape[1] > 3)  # a place
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoggedOdometry:
+    """What a log has of odometry, and of the truth beside it.
+
+    Parameters
+    ----------
+    source : LogSource
+        Of messages.
+    fixes : Fixes
+        Of a receiver.
+    estimate : Estimate
+        Without the poses that are not known.
+    attitudes : Stream, optional
+        Of the vehicle, as `Streams` has them.
+    notes : tuple of str
+        What else is to be said.
+    """
+
+    source: LogSource
+    fixes: Fixes
+    estimate: Estimate
+    attitudes: Stream | None
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        source: LogSource,
+        fixes: tuple[Fixes, tuple[str, ...]],
+        estimates: Sequence[Estimate],
+        attitudes: Stream | None,
+        notes: tuple[str, ...],
+    ) -> "LoggedOdometry":
+        """Return what a log has, of estimates the first; raise `FlightError` if it has none, or none with poses."""
+        truth, others = fixes
+        if not estimates:
+            raise source.fault("holds no odometry: neither poses of a camera nor those of the estimator are logged")
+        poses = without_unknown(estimates[0].poses)
+        if poses is None:
+            raise source.fault(f"{estimates[0].poses.name} has no pose with a place and an attitude: log them")
+        return cls(
+            source=source,
+            fixes=truth,
+            estimate=replace(estimates[0], poses=poses),
+            attitudes=without_unknown(attitudes),
+            notes=(*others, *notes),
+        )
 
 
 def free_stretches(flags: Sequence[tuple[Floats, Bools]]) -> tuple[tuple[float, float], ...]:

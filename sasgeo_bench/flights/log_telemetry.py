@@ -27,6 +27,7 @@ from sasgeo_bench.flights.log_streams import (
     Clock,
     Estimate,
     Fixes,
+    LoggedOdometry,
     Stream,
     Streams,
     first_with_fixes,
@@ -302,6 +303,14 @@ def estimates_of(telemetry: Telemetry) -> list[Estimate]:
             f"no odometry: {why}, and telemetry does not say when the autopilot did: take its own log"
         )
     return found
+
+
+def read_odometry(path: Path, *, vehicle: int | None = None) -> LoggedOdometry:
+    """Read the odometry that a vehicle's companion sent; raise `FlightError` if there is none, or no fixes."""
+    telemetry = read_telemetry(path, vehicle=vehicle)
+    return LoggedOdometry.of(
+        telemetry.source, fixes_of(telemetry), estimates_of(telemetry), attitudes_of(telemetry), telemetry.notes
+    )
 
 
 def _booted(messages: Mapping[str, Columns]) -> tuple[Floats, Floats]:

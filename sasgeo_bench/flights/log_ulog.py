@@ -24,6 +24,7 @@ from sasgeo_bench.flights.log_streams import (
     Clock,
     Estimate,
     Fixes,
+    LoggedOdometry,
     Stream,
     Streams,
     first_with_fixes,
@@ -246,6 +247,19 @@ def estimates_of(topics: Topics) -> list[Estimate]:
     poses = np.column_stack([columns[key] for key in ("x", "y", "z")])
     stream = Stream.of(topics.source, name, seconds(columns)[is_valid], poses[is_valid])
     return [Estimate(poses=stream, free_s=free_s, fused=fused)]
+
+
+def read_odometry(path: Path) -> LoggedOdometry:
+    """Read the odometry of a ULog file; raise `FlightError` if it has none, or no fixes of a receiver."""
+    return odometry_of(read_topics(path, OF_DRIFT))
+
+
+def odometry_of(topics: Topics) -> LoggedOdometry:
+    """Return the odometry in the topics `OF_DRIFT`, as `read_odometry` does."""
+    with known_fields(topics.source):
+        return LoggedOdometry.of(
+            topics.source, fixes_of(topics), estimates_of(topics), attitudes_of(topics), topics.notes
+        )
 
 
 def _without_receiver(topics: Topics) -> tuple[tuple[tuple[float, float], ...], str]:

@@ -89,10 +89,11 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
     return replace(log, height_m=np.full(len(log), height_m), notes=notes)
 
 
-def read_places(path: Path) -> Floats:
+def read_places(path: Path, *, vehicle: int | None = None) -> Floats:
     """Return longitude and latitude of the points of a log, shape (N, 2); what else it holds needs no unit."""
-    is_table = path.suffix.lower() in _TABLES
-    facts = LogFacts(time_unit="none", height_unit="none", angle_unit="none") if is_table else None
+    facts = LogFacts(vehicle=vehicle)
+    if path.suffix.lower() in _TABLES:
+        facts = replace(facts, time_unit="none", height_unit="none", angle_unit="none")
     log = read_log(path, facts)
     return np.column_stack([log.lon_deg, log.lat_deg])
 

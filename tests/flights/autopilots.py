@@ -363,7 +363,7 @@ def px4_messages(flown: Flown, *, is_new: bool = True) -> list[Message]:
 LEVEL = Flown(count=600, is_level=True)  # 950 m
 STATUS = "uint64_t timestamp;uint32_t control_mode_flags;"
 _GPS_BIT = 1 << 2
-_OTHERS = 1 << 0 | 1 << 1 | 1 << 7 | 1 << 12  # aligned, in the air, with poses of a camera
+OTHERS = 1 << 0 | 1 << 1 | 1 << 7 | 1 << 12  # aligned, in the air, with poses of a camera
 
 
 def north_east_m(flown: Flown = LEVEL) -> Floats:
@@ -395,5 +395,5 @@ def px4_drift(scale: float, flags: Mapping, *, fix_type: int = 3, **more) -> dic
 def fusing(is_fused: Callable[[float], bool], *, every_s: float = 0.5) -> tuple[str, list[tuple]]:
     """Flags of an estimator that fuses GNSS, or does not, at times of the flight."""
     times_s = np.arange(0, LEVEL.time_s[-1], every_s)
-    rows = [(us, _OTHERS | _GPS_BIT * is_fused(one)) for us, one in zip(stamps_us(times_s), times_s, strict=True)]
+    rows = [(us, OTHERS | _GPS_BIT * is_fused(one)) for us, one in zip(stamps_us(times_s), times_s, strict=True)]
     return STATUS, rows

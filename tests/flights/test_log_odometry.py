@@ -23,8 +23,10 @@ from tests.flights.autopilots import (
     dataflash_text,
     fusing,
     gps_rows,
+    mavros_messages,
     north_east_m,
     px4_drift,
+    stamp,
     stamps_us,
     tlog,
     turn,
@@ -104,6 +106,23 @@ def test_an_estimate_that_fused_gnss_is_refused_by_name(tmp_path: Path, flags, m
         read_runs(write(tmp_path / "a.ulg", ulog(px4_drift(1.02, flags, **more))))
 
 
+# https://docs.px4.io/main/en/msg_docs/EstimatorStatus and EstimatorStatusFlags: whatever comes of a receiver, or as one
+@pytest.mark.parametrize("bit", [2, 22, 38, 44])
+def test_each_bit_that_a_receiver_is_fused_by_counts(tmp_path: Path, bit: int) -> None:
+    rows = [(us, autopilots.OTHERS | 1 << bit) for us in stamps_us(np.arange(0, 119.0))]
+    flags = {("estimator_status", 0): ("uint64_t timestamp;uint64_t control_mode_flags;", rows)}
+    with pytest.raises(FlightError, match="vehicle_local_position 0 fused GNSS from start to end"):
+        read_runs(write(tmp_path / "a.ulg", ulog(px4_drift(1.02, flags))))
+
+
+@pytest.mark.parametrize("name", ["cs_gps", "cs_gnss_pos", "cs_gnss_vel", "cs_gps_yaw", "cs_gnss_yaw", "cs_aux_gpos"])
+def test_each_flag_that_a_receiver_is_fused_by_counts(tmp_path: Path, name: str) -> None:
+    rows = [(us, False, True) for us in stamps_us(np.arange(0, 119.0))]
+    flags = {("estimator_status_flags", 0): (f"uint64_t timestamp;bool cs_ev_pos;bool {name};", rows)}
+    with pytest.raises(FlightError, match="vehicle_local_position 0 fused GNSS from start to end"):
+        read_runs(write(tmp_path / "a.ulg", ulog(px4_drift(1.02, flags))))
+
+
 def test_a_global_estimate_is_no_truth(tmp_path: Path) -> None:
     log = px4_drift(1.02, {("estimator_status", 0): fusing(_middle)})
     rows = [(row[0], *row[2:5]) for row in log.pop(("vehicle_gps_position", 0))[1]]
@@ -181,6 +200,61 @@ def test_a_bag_of_px4_has_the_odometry_of_its_ulog(tmp_path: Path) -> None:
     ]
     logged = read_runs(bag(tmp_path / "a.mcap", sorted(messages, key=lambda one: one[2])))
     assert figure(logged, "position_pct") == pytest.approx(2, abs=0.01)
+
+
+def _odometry(topic: str, scale: float = 1.03) -> list:
+    """Poses of a camera in axes of ROS, in a frame that is turned, beside what mavros publishes."""
+    place_m = north_east_m() * scale
+    messages = mavros_messages(FLOWN, late_s=0.0)
+    turned = np.radians(70.0)
+    for at, time_s in enumerate(FLOWN.time_s.tolist()):
+        north, east = place_m[at]
+        x, y = np.cos(turned) * east - np.sin(turned) * north, np.sin(turned) * east + np.cos(turned) * north
+        half = (np.radians(90 - FLOWN.yaw_deg[at]) + turned) / 2  # counter-clockwise from east
+        pose = {
+            "position": {"x": float(x), "y": float(y), "z": 80.0},
+            "orientation": {"w": float(np.cos(half)), "x": 0.0, "y": 0.0, "z": float(np.sin(half))},
+        }
+        fields = {"header": {"stamp": stamp(time_s)}, "pose": {"pose": pose}}
+        messages.append((topic, "nav_msgs/msg/Odometry", START_S * 10**9 + round(time_s * 1e9), fields))
+    return messages
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.mcap"])
+def test_a_topic_of_a_bag_is_odometry_where_it_is_said_to_have_fused_no_gnss(tmp_path: Path, name: str) -> None:
+    pytest.importorskip("rosbags", reason="needs the extra [logs]")
+    path = bag(tmp_path / name, _odometry("/vio/odometry"))
+    with pytest.raises(
+        FlightError, match=r"no bag says of poses whether .*: say --topic, one of '/vio/odometry', if it"
+    ):
+        read_runs(path)
+    with pytest.raises(FlightError, match="has no poses on '/vio': say --topic, one of '/vio/odometry'"):
+        read_runs(path, topic="/vio")
+    logged = read_runs(path, topic="/vio/odometry")
+    assert figure(logged, "position_pct") == pytest.approx(3, abs=0.02)
+    assert figure(logged, "yaw_deg") == pytest.approx(0, abs=0.02)
+    assert logged.notes[1].endswith(" without GNSS (as --topic says)")
+    with pytest.raises(FlightError, match=r"a\.ulg is no bag: leave out --topic"):
+        read_runs(tmp_path / "a.ulg", topic="/vio/odometry")
+
+
+@pytest.mark.parametrize(
+    "topic", ["/mavros/local_position/odom", "/mavros/global_position/local", "/odometry/filtered"]
+)
+def test_a_topic_that_fused_gnss_is_refused_by_its_name(tmp_path: Path, topic: str) -> None:
+    pytest.importorskip("rosbags", reason="needs the extra [logs]")
+    path = bag(tmp_path / "a.mcap", _odometry(topic))
+    with pytest.raises(FlightError, match=f"{topic} is what the autopilot or a filter made of the receiver: a copy of"):
+        read_runs(path, topic=topic)
+
+
+def test_odometry_beside_no_receiver_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="needs the extra [logs]")
+    messages = [one for one in _odometry("/vio") if not one[0].endswith("raw/fix")]
+    with pytest.raises(FlightError, match="/mavros/global_position/global is an estimate, and no truth"):
+        read_runs(bag(tmp_path / "a.mcap", messages), topic="/vio")
+    with pytest.raises(FlightError, match="say --topic, of poses, of which it has none"):
+        read_runs(bag(tmp_path / "b.mcap", mavros_messages(FLOWN)))
 
 
 # ArduPilot
@@ -360,5 +434,5 @@ def test_a_slow_instance_that_fused_is_not_passed_over_between_its_flags() -> No
 
 @pytest.mark.parametrize("name", ["a.gpx", "a.csv", "a"])
 def test_a_file_that_has_no_odometry_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(FlightError, match=r"is no log with odometry that is read: .ulg, .bin, .log, .tlog are, and ba"):
+    with pytest.raises(FlightError, match=r"is no log with odometry that is read: .ulg, .bin, .log, .tlog, .bag"):
         read_runs(tmp_path / name)

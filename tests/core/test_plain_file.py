@@ -45,6 +45,8 @@ OWN = {
     ("observing/masks.py", "np.load"),  # of bytes
     ("observing/posed_pictures.py", "Image.open"),  # as above
     ("observing/pictures.py", "rasterio.open"),  # a view of a file that is open, in memory
+    ("observing/video.py", "path.read_bytes"),  # of what the same function has just written
+    ("regions/packed_map.py", "tarfile.open"),  # of a plain file that is open
 }
 
 

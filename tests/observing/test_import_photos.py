@@ -354,6 +354,7 @@ def test_visual_odometry_is_what_the_pictures_show(flown, program):
     assert line.startswith("visual odometry: 2 of 5 pairs of pictures lost (40%); off the files' positions by 0.")
 
 
+@pytest.mark.slow
 def test_visual_odometry_does_not_know_the_positions(flown):
     plain, moved = (
         [(query.step, query.prior.center_m) for query in quiet(flown(shifts, odometry="visual"))[0][1].queries()]

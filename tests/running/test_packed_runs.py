@@ -16,6 +16,7 @@ from sasgeo_bench.running.plan import RunRequest, plan_run, reach_of
 from sasgeo_bench.running.prediction_files import RunManifest, parts_of
 from sasgeo_bench.running.profiling import ProfileRequest, profile
 from tests import world
+from tests.slow import rest_slow
 
 TOWN = "town-riverside"
 TIMED = ("latency_s", "matcher_s")  # which no two runs have in common
@@ -44,7 +45,7 @@ def rows(runs: Path) -> bytes:
     return frame.drop(columns=[*TIMED]).sort_values("query_id").to_json(orient="records", double_precision=15).encode()
 
 
-@pytest.mark.parametrize("matcher", ["sasgeo", "random"])
+@pytest.mark.parametrize("matcher", rest_slow(["random", "sasgeo"]))
 def test_the_answers_are_the_same_bytes(tasks, aboard, matcher, tmp_path):
     out, task = aboard
     here = Path(shutil.copytree(tasks, tmp_path / "here"))

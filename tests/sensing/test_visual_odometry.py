@@ -139,6 +139,7 @@ def test_tilts_that_are_believed_wrongly_are_found_out():
     assert np.hypot(*off[:2]) < 0.4
 
 
+@pytest.mark.slow
 def test_standard_deviations_cover_the_errors_and_are_not_vast():
     rng = np.random.default_rng(3)
     far = []

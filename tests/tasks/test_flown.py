@@ -83,12 +83,14 @@ def test_a_log_that_tells_the_date_tells_when_each_view_was_flown(root, tmp_path
         assert at.distance(shapely.Point(truth.pose.easting_m, truth.pose.northing_m)) < 5.0
 
 
+@pytest.mark.slow
 def test_a_log_without_a_date_tells_no_utc(root, tmp_path):
     epsg = read_manifest(root / "regions" / TOWN).epsg
     make_tasks(request_of(root, flown=FlownPath(file=log_of(tmp_path / "log.csv", corners(root), epsg))))
     assert not any("utc_s" in truth.measured for truth in read_truths(root / "truth" / "flight-clean" / TOWN))
 
 
+@pytest.mark.slow
 def test_a_flight_is_drawn_anew_when_its_log_or_its_height_changes(root, tmp_path):
     epsg = read_manifest(root / "regions" / TOWN).epsg
     log = log_of(tmp_path / "log.csv", corners(root), epsg)

@@ -19,7 +19,15 @@ from sasgeo_bench.scoring.flights import share_within
 from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, REJECTOR, TRACK, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import Interval
 from sasgeo_bench.scoring.metric import MeanMetric, Metric, QuantileMetric, ThresholdMetric
-from sasgeo_bench.scoring.metrics import ANY_DEG, LOCALIZATION, METRICS, RISKS, TRACKS, within_metric, within_name
+from sasgeo_bench.scoring.metrics import (
+    ANY_DEG,
+    LOCALIZATION,
+    METRICS,
+    RISKS,
+    TRACKS,
+    within_metric,
+    within_name,
+)
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked
 from sasgeo_bench.scoring.strata import ALL, STRESS
@@ -298,7 +306,8 @@ class Compliance:
         str,
         Shown(
             "passes: the worse end of the 95 % interval meets the requirement; fails: the better end does not; not "
-            "shown: the interval holds the bound, or there is none, or nothing was accepted",
+            "shown: the interval holds the bound, or there is none, or nothing was accepted, or it is a figure of "
+            "single views asked of flights, or the other way round",
             "requirement",
         ),
     ]
@@ -311,8 +320,8 @@ _KEY: Final = ["suite", "track", "prior_group", "matcher"]
 def compliance_frame(requirements: Sequence[Requirement], board: pd.DataFrame) -> pd.DataFrame:
     """Return what the figures of a board say of requirements, with the columns of `Compliance`.
 
-    There is a row for each entry that is no control, each of its suites, tracks and prior groups, and each requirement
-    that asks about the track; of accepted answers one for each rejector. Figures are those of the tables of suites:
+    There is a row for each entry that is no control, each of its suites, tracks and prior groups, and each requirement;
+    of accepted answers one for each rejector. Figures are those of the tables of suites:
     under stress, or of all queries where nothing is stressed; thresholds are of all queries of a suite.
     """
     if not requirements:
@@ -331,8 +340,11 @@ def compliance_frame(requirements: Sequence[Requirement], board: pd.DataFrame) -
 def _of_entry(requirement: Requirement, part: pd.DataFrame, *, is_timed: bool) -> Iterator[Compliance]:
     """Yield the rows of one requirement, from all figures of an entry on a suite, track and prior group."""
     suite, track, prior_group, matcher = (str(part[name].iloc[0]) for name in _KEY)
-    name = requirement.figures.get(track)
-    if name is None:
+    name = requirement.figures.get(track, "")
+    if not name and track not in (
+        LOCALIZATION,
+        SEQUENCE,
+    ):  # of ranks alone, which no requirement in metres or seconds is about
         return
     mine = part[part["metric"] == name]
     is_threshold = isinstance(_SHIPPED.get(name), ThresholdMetric)
@@ -353,7 +365,7 @@ def _of_entry(requirement: Requirement, part: pd.DataFrame, *, is_timed: bool) -
             track=track,
             prior_group=prior_group,
             requirement=requirement.text,
-            metric=name,
+            metric=name or "none of this track",
             unit=str(row.get("unit", "1")),
             stratum=str(row.get("stratum", "")),
             n=int(row.get("n", 0)),

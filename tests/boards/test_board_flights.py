@@ -22,6 +22,7 @@ from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.scoring.flights import score_flights
+from sasgeo_bench.scoring.requirements import compliance_frame, parse_requirements
 from sasgeo_bench.tasks import flight_sampling, task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
@@ -298,3 +299,12 @@ def test_the_receiver_is_checked_by_the_fixes_of_a_run(out, program, mistake):
     assert "--pull-off must be positive metres a second" in mistake(
         "check-gnss", out / "runs" / "near", "--pull-off", "0"
     )
+
+
+def test_a_requirement_of_single_views_is_not_shown_of_flights_and_not_passed_over(out):
+    board = read_leaderboard(out / "boards" / "mine")
+    rows = compliance_frame(parse_requirements(["position_p95 <= 30 m, 1% within 200 m"]), board)
+    found = {(row["matcher"], row["requirement"]): row["verdict"] for row in rows.to_dict("records")}
+    assert {name for name, _ in found} == {"near", "far"}
+    assert {verdict for (_, text), verdict in found.items() if text.startswith("position")} == {"not shown"}
+    assert len(found) == 4

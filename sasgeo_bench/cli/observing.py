@@ -212,7 +212,7 @@ def locate_command(options: LocateOptions) -> None:
     say(found.request.into / PAGE)
     failed = sum(fix.status == "failed" for fix in found.fixes)
     if failed:
-        complain(f"{failed} of {len(found.fixes)} pictures could not be read; their rows say why")
+        complain(f"{failed} of {len(found.fixes)} pictures could not be asked; their rows say why")
         raise typer.Exit(CONTESTANT_FAILED)
 
 

@@ -121,7 +121,8 @@ def _send(
     with shown_progress():
         report = replayed(request)
     late = f"late by {report.late_ms(0.5):.1f} ms (p50), {report.late_ms(0.99):.1f} ms (p99)"
-    say(f"{counted(len(sent), 'fix', 'fixes')} sent to {target.text}, {late}")
+    heard = "; nobody listened" if report.refused else "; UDP does not tell whether they arrived"
+    say(f"{counted(len(sent), 'fix', 'fixes')} sent to {target.text}, {late}{heard}")
     if report.refused:
         complain(f"nobody listened at {target.text} to {report.refused} of {counted(report.packets, 'packet')}")
         raise typer.Exit(CONTESTANT_FAILED)

@@ -3,19 +3,24 @@
 
 import datetime as dt
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
+import numpy as np
+import pyproj
+
 from sasgeo_bench.core.errors import FlightError, PoseError, SasgeoError, counted, named
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_points import AltitudeOf as LogAltitudeOf
 from sasgeo_bench.observing.picture_poses import AltitudeOf, PicturePose, PoseTable
-from sasgeo_bench.observing.tracks import Moment, Track, read_track
+from sasgeo_bench.observing.tracks import LOOKS_DOWN, Moment, Track, read_track
 from sasgeo_bench.sensing.photos import Photo, read_photo
 
+_WGS84: Final = pyproj.Geod(ellps="WGS84")
+_FAR_M: Final = 50.0  # no receiver is as far off
 _ALTITUDES: Final[Mapping[LogAltitudeOf, AltitudeOf]] = MappingProxyType(
     {"geoid": "sea", "ellipsoid": "ellipsoid", "unknown": "unstated"}
 )
@@ -59,7 +64,7 @@ def poses_by_log(log: Path, photos: Mapping[str, Path], *, offset_s: float | Non
             left_out["that cannot be read"].append(name)
             continue
         if photo.taken_at is None:
-            left_out["that does not say when it was taken"].append(name)
+            left_out["without a time (EXIF's DateTimeOriginal)"].append(name)
         else:
             taken[name] = photo
     times_s = _in_log(track, taken, offset_s)
@@ -73,16 +78,32 @@ def poses_by_log(log: Path, photos: Mapping[str, Path], *, offset_s: float | Non
             poses.append(_pose(name, replace(moment, camera=None) if has_gimbal else moment, track, time_s))
     if not poses:
         why = "; ".join(f"{named([plain(name) for name in names], 'photo')} {why}" for why, names in left_out.items())
-        mend = "" if offset_s is not None else ": if a clock is wrong, say --offset"
+        mend = ": if a clock is wrong, say --offset" if times_s and offset_s is None else ""
         raise PoseError(f"no photo was taken while {plain(log.name)} ran ({why}){mend}")
     first = min(times_s.values())
     how = "as --offset says" if offset_s is not None else "by UTC of both"
+    is_looked_up = any(pose.attitude is not None for pose in poses)
     notes = (
         f"the first of {counted(len(times_s), 'photo')} was taken {first:.1f} s after the log begins, {how}",
-        *track.notes,
+        *_apart(poses, taken),
+        *(note for note in track.notes if is_looked_up or note != LOOKS_DOWN),
     )
     out = {why: tuple(names) for why, names in left_out.items()}
     return PoseTable(path=log, kind="flight log", poses=tuple(poses), left_out=out, notes=notes)
+
+
+def _apart(poses: Sequence[PicturePose], taken: Mapping[str, Photo]) -> list[str]:
+    """Return a line where the log puts photos far from where they say that they are: the clocks are off."""
+    apart_m = []
+    for pose in poses:
+        photo = taken[pose.name]
+        if photo.lon_deg is not None and photo.lat_deg is not None:
+            apart_m.append(_WGS84.inv(*pose.lonlat, photo.lon_deg, photo.lat_deg)[2])
+    median_m = float(np.median(apart_m)) if apart_m else 0.0
+    if median_m <= _FAR_M:
+        return []
+    whose = f"{counted(len(apart_m), 'photo')} {median_m:.0f} m (median) from their own positions"
+    return [f"the log puts {whose}, which are not used: is the offset right?"]
 
 
 def _in_log(track: Track, taken: Mapping[str, Photo], offset_s: float | None) -> dict[str, float]:

@@ -21,6 +21,7 @@ from sasgeo_bench.sensing.camera import Attitude
 
 Floats = NDArray[np.float64]
 
+LOOKS_DOWN: Final = "no angles of the camera: taken as looking straight down, its up as the drone heads"
 _ENDS_S: Final = 1.0  # before the first and after the last point of a track whose place is still that of a point
 _DEGREE_M: Final = 111_195.0  # of latitude
 _DIGITS: Final = 7  # behind the point of a degree that are as good as any
@@ -108,7 +109,7 @@ def read_track(path: Path) -> Track:
     if angles is None and log.yaw_deg is not None:
         # The gimbal follows the body's yaw, unless it is turned by hand.
         angles = np.column_stack([log.yaw_deg, np.full(len(log), -90.0), np.zeros(len(log))])
-        notes.append("no angles of the camera: taken as looking straight down, its up as the drone heads")
+        notes.append(LOOKS_DOWN)
     return Track(
         path=path,
         log=log,

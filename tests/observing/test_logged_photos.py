@@ -8,7 +8,7 @@ from PIL import ExifTags, Image
 from sasgeo_bench.core.errors import ConfigError, FlightError, PoseError
 from sasgeo_bench.observing.import_photos import ImportRequest
 from sasgeo_bench.observing.logged_photos import poses_by_log
-from tests.sensing.test_photos import xmp_of
+from tests.sensing.test_photos import write_photo, xmp_of
 
 LON, LAT, STEP = 9.52, 47.14, 1e-4
 
@@ -22,6 +22,15 @@ def log_of(path, *, gap=(), clock="2025-05-01T10:00:{:06.3f}Z"):
     ]
     path.write_text("\n".join(["time,lat,lon,height_agl_m,alt_m,heading_deg", *rows]) + "\n", encoding="ascii")
     return path
+
+
+def gps_of(lon, lat):
+    return {
+        ExifTags.GPS.GPSLatitudeRef: "N",
+        ExifTags.GPS.GPSLatitude: (lat, 0, 0),
+        ExifTags.GPS.GPSLongitudeRef: "E",
+        ExifTags.GPS.GPSLongitude: (lon, 0, 0),
+    }
 
 
 def photo(path, time, *, offset="+02:00", part="", xmp=b""):
@@ -80,11 +89,22 @@ def test_photos_that_the_log_does_not_tell_are_left_out_with_the_reason(tmp_path
     assert table.left_out == {
         "that the track does not cover": ("early",),
         "in a gap of more than 10 s of the track": ("gap",),
-        "that does not say when it was taken": ("timeless",),
+        "without a time (EXIF's DateTimeOriginal)": ("timeless",),
         "that cannot be read": ("broken",),
     }
     with pytest.raises(PoseError, match=r"no photo was taken while log.csv ran .*: if a clock is wrong, say --offset"):
         poses_by_log(log, {"early": found["early"]})
+    with pytest.raises(PoseError, match=r"\(1 photo \(timeless\) without a time \(EXIF's DateTimeOriginal\)\)$"):
+        poses_by_log(log, {"timeless": found["timeless"]})
+
+
+def test_a_log_that_contradicts_the_photos_own_positions_is_told(tmp_path):
+    log = log_of(tmp_path / "log.csv")
+    for far_deg, is_told in ((0.0, False), (0.01, True)):
+        path = tmp_path / f"{far_deg}.jpg"
+        write_photo(path, gps=gps_of(LON, LAT + 5 * STEP + far_deg))
+        notes = " ".join(poses_by_log(log, {"a": path}, offset_s=5.0).notes)
+        assert ("the log puts 1 photo 1112 m (median) from their own positions" in notes) is is_told
 
 
 def test_the_gimbal_of_a_photo_goes_before_the_body_of_the_drone(tmp_path):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 GPS_EPOCH_S: Final = 315_964_800  # 1980-01-06, from which GPS counts, in seconds since 1970
 WEEK_S: Final = 604_800
+_END_S: Final = 2**31  # in 2038, to which stamps of ROS go
 
 # Days from which UTC is a second further behind GPS: https://hpiers.obspm.fr/iers/bul/bulc/Leap_Second.dat
 # (IERS, Bulletin C); none is announced after them.
@@ -37,6 +38,15 @@ def utc_of_gps(gps_s: NDArray[np.float64]) -> NDArray[np.float64]:
     [-16.0, -18.0]
     """
     return np.asarray(GPS_EPOCH_S + gps_s - np.searchsorted(_STARTS, gps_s, side="right"))
+
+
+def is_date(utc_s: float) -> bool:
+    """Return whether seconds since 1970, UTC, may be a date of a flight; a clock that was never set tells none.
+
+    >>> is_date(1_777_629_600.0), is_date(10.0), is_date(1e15)
+    (True, False, False)
+    """
+    return GPS_EPOCH_S <= utc_s < _END_S
 
 
 def week_of_utc(utc_s: float) -> tuple[int, int]:

@@ -233,6 +233,8 @@ class _Bag:
                 row = [value for get in getters for value in np.ravel(get(message)).tolist()]
                 width = len(row)
                 values.extend(row)
+        if not recorded:
+            raise self.source.fault(f"says that {shown(connection.topic)} has messages, and holds none: {_MEND}")
         return _Table(
             name=connection.topic,
             recorded_ns=np.array(recorded, dtype=np.int64),

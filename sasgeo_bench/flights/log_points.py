@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.core.errors import FlightError, counted
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import message_of, plain
+from sasgeo_bench.flights.leap_seconds import is_date
 from sasgeo_bench.flights.log_units import FASTEST_MPS, HIGHEST_M
 
 Floats = NDArray[np.float64]
@@ -151,7 +152,7 @@ class FlightLog:
         `names` tell, for messages too, what the file calls a column, and in which unit.
 
         Points at 0, 0 before the first fix are left out, and so are points that repeat the time of the point before, or
-        its place where there are no times. A warning counts them.
+        its place where there are no times. A warning counts them, and tells of a start that is no date since GPS.
 
         Raises
         ------
@@ -177,6 +178,9 @@ class FlightLog:
         for name, most in {**_ANGLES, "height_m": HIGHEST_M}.items():
             if name in columns:
                 _check_size(source, numbers, columns[name], name, most, names.get(name, name.partition("_")[0]))
+        if start_s is not None and not is_date(start_s):
+            source.warn("its clock was not set, as it tells no date from 1980 to 2038: UTC is not known")
+            start_s = None
         return cls(
             lon_deg=columns["lon_deg"],
             lat_deg=columns["lat_deg"],

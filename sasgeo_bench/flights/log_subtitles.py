@@ -26,8 +26,11 @@ _NUMBER: Final = r"[+-]?\d+(?:\.\d+)?"
 # The end of a block is not used, so that one at 00:00:60,000 is as good as any.
 _TIMES: Final = re.compile(r"^[ \t]*(\d+):(\d{1,2}):(\d{1,2})[,.](\d{1,6})[ \t]*-->.*$", re.MULTILINE)
 _TAG: Final = re.compile(r"<[^<>]{0,200}>")
-_PAIR: Final = re.compile(rf"([A-Za-z_]+)\s*:\s*({_NUMBER})(?![\d:])")  # several stand in one bracket
-_CALL: Final = re.compile(r"([A-Za-z][A-Za-z.]*)\s*\(([^()]{0,200})\)")  # as in GPS (8.5,47.4,12), G.PRY (-90.0, 0, 3)
+# Names are of 40 letters at most: without an end, a text of letters alone would take the square of its length.
+_PAIR: Final = re.compile(rf"([A-Za-z_]{{1,40}})\s*:\s*({_NUMBER})(?![\d:])")  # several stand in one bracket
+_CALL: Final = re.compile(
+    r"([A-Za-z][A-Za-z.]{0,39})\s*\(([^()]{0,200})\)"
+)  # as in GPS (8.5,47.4,12), G.PRY (-90.0, 0, 3)
 _ABOVE_HOME: Final = re.compile(rf"\bH\s+({_NUMBER})\s*m\b(?!/s)")
 _CLOCK: Final = re.compile(
     r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})[ T]+(\d{1,2}):(\d{2}):(\d{2})((?:[,.:]\d{1,6}){0,2})(?!\d)"

@@ -7,6 +7,7 @@ late. https://mavlink.io/en/messages/common.html
 """
 
 import mmap
+import re
 import struct
 from array import array
 from collections.abc import Iterator, Mapping
@@ -52,6 +53,7 @@ VISION: Final = "VISION_POSITION_ESTIMATE"
 _WITHOUT_GNSS: Final = (2, 3, 7)
 _EPOCH_S: Final = 1e9  # a clock that counts from the start of an autopilot never comes there
 _V1, _V2 = 0xFE, 0xFD
+_HEADS: Final = re.compile(rb"[\xfd\xfe]")
 _FAULTS: Final = (struct.error, ValueError, KeyError, IndexError, TypeError, AttributeError)  # of a damaged packet
 _STAMP: Final = 8  # bytes of the time before each packet
 
@@ -188,7 +190,9 @@ class _Packets:
             after = start + length
             # one that is followed by no other is none, but at the end
             if not length or (after < end and not _begins(content, after)):
-                at, self.skipped = at + 1, self.skipped + 1
+                following = _HEADS.search(content, start + 1)
+                begin = end - _STAMP if following is None else following.start() - _STAMP
+                at, self.skipped = begin, self.skipped + begin - at
                 continue
             if after > end:
                 self.is_cut = True

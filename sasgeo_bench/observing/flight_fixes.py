@@ -150,8 +150,8 @@ def _run_in(folder: Path) -> Path:
 def _of_task(task: Task, answers: Mapping[str, Prediction], flight: str | None, run: Path) -> FlightFixes:
     flights: dict[str, list[tuple[Head, Truth]]] = {}
     for head, truth in zip(sorted(task.heads(), key=lambda head: head.query_id), task.truths, strict=True):
-        if head.query_id in answers:
-            flights.setdefault(head.sequence_id or "", []).append((head, truth))
+        flights.setdefault(head.sequence_id or "", []).append((head, truth))
+    flights = {name: views for name, views in flights.items() if any(head.query_id in answers for head, _ in views)}
     name = _chosen(flights, flight, run)
     views = flights[name]
     missing = next((truth.query_id for _, truth in views if "time_s" not in truth.measured), None)
@@ -161,7 +161,7 @@ def _of_task(task: Task, answers: Mapping[str, Prediction], flight: str | None, 
     is_utc = all(UTC in truth.measured for _, truth in views)
     times_ns = [round(truth.measured[UTC if is_utc else "time_s"] * 1000) * (NS // 1000) for _, truth in views]
     epsg = task.manifest.epsg or read_manifest(task.region).epsg
-    fixes = _placed([head for head, _ in views], [answers[head.query_id] for head, _ in views], times_ns, epsg)
+    fixes = _placed([head for head, _ in views], [answers.get(head.query_id) for head, _ in views], times_ns, epsg)
     if not fixes:
         raise ConfigError(
             f"none of the {counted(len(views), 'view')} of flight {name} has an answer: see inspect {run}"
@@ -194,9 +194,13 @@ def _chosen(flights: Mapping[str, Sequence[tuple[Head, Truth]]], flight: str | N
 
 
 def _placed(
-    heads: Sequence[Head], answers: Sequence[Prediction], times_ns: Sequence[int], epsg: int
+    heads: Sequence[Head], found: Sequence[Prediction | None], times_ns: Sequence[int], epsg: int
 ) -> list[PlacedFix]:
     """Return the fixes among the answers to the views of one flight, in order."""
+    # A view without an answer stays in its place: the odometer led past it.
+    answers = [
+        one or Prediction(query_id=head.query_id, status="crash") for head, one in zip(heads, found, strict=True)
+    ]
     # What failed or hung is no part of a fix's delay: the runner ended it.
     latencies_s = [0.0 if answer.status != "ok" else answer.latency_s for answer in answers]
     delays_s = _delays_s(latencies_s, times_ns)
@@ -208,7 +212,7 @@ def _placed(
     lon_deg, lat_deg = (np.asarray(one) for one in to_lonlat(epsg).transform(*en_m.T))
     north_deg = true_north_deg(lon_deg, lat_deg, epsg)
     heading_deg = normalize_deg([pose.yaw_deg for pose in poses] - north_deg)
-    found: list[PlacedFix] = []
+    fixes: list[PlacedFix] = []
     last: int | None = None  # index of the accepted fix before
     for row, index in enumerate(at):
         answer = answers[index]
@@ -217,7 +221,7 @@ def _placed(
         if is_accepted:
             is_jump = last is not None and _is_jump(heads, answers, last, index)
             last = index
-        found.append(
+        fixes.append(
             PlacedFix(
                 name=answer.query_id,
                 lon_deg=float(lon_deg[row]),
@@ -234,7 +238,7 @@ def _placed(
                 is_jump=is_jump,
             )
         )
-    return found
+    return fixes
 
 
 def _delays_s(latencies_s: Sequence[float | None], times_ns: Sequence[int]) -> list[float | None]:

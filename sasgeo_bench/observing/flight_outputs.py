@@ -13,6 +13,7 @@ import numpy as np
 
 from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.flights.leap_seconds import is_date
 from sasgeo_bench.geometry.pose import rotation
 from sasgeo_bench.matching.tracker import SIDE
 from sasgeo_bench.observing.fix_files import NS, PlacedFix, geojson_text, gpx_text, kml_text, tum_text
@@ -44,8 +45,8 @@ def check_output(path: Path, flight: FlightFixes, sent: Sequence[Departure], kin
 
 
 def check_dated(flight: FlightFixes, what: str) -> None:
-    """Raise `ConfigError` if it is not known when a flight began."""
-    if flight.start_ns is None:
+    """Raise `ConfigError` if it is not known when a flight began, or a clock that was not set says so."""
+    if flight.start_ns is None or not is_date(flight.start_ns / NS):
         raise ConfigError(
             f"flight {flight.flight} does not say when it began, and {what} holds dates: give one, as in --start "
             "2026-05-01T10:00:00Z"

@@ -111,11 +111,16 @@ def _in_log(track: Track, taken: Mapping[str, Photo], offset_s: float | None) ->
     clock_s = {name: _seconds(photo) for name, photo in taken.items()}
     if not clock_s:
         return {}
+    without = [name for name, photo in taken.items() if photo.utc_offset is None]
+    if not without:  # cameras may be set to several zones
+        ahead_s = {
+            name: photo.utc_offset.total_seconds() for name, photo in taken.items() if photo.utc_offset is not None
+        }
+        clock_s = {name: clock_s[name] - ahead_s[name] for name in clock_s}
     if offset_s is not None:
         first_s = min(clock_s.values())
         return {name: offset_s + (seconds - first_s) for name, seconds in clock_s.items()}
     start_s = track.log.start_s
-    without = [name for name, photo in taken.items() if photo.utc_offset is None]
     lacks = []
     if without:
         lacks.append(f"{named([plain(name) for name in without], 'photo')} without the zone of the clock")
@@ -123,8 +128,7 @@ def _in_log(track: Track, taken: Mapping[str, Photo], offset_s: float | None) ->
         lacks.append(f"{plain(track.path.name)} does not say UTC")
     if start_s is None or without:
         raise FlightError(f"{', and '.join(lacks)}: say --offset, the seconds of the log at the first photo")
-    ahead_s = {name: photo.utc_offset.total_seconds() for name, photo in taken.items() if photo.utc_offset is not None}
-    return {name: clock_s[name] - ahead_s[name] - start_s for name in ahead_s}
+    return {name: seconds - start_s for name, seconds in clock_s.items()}
 
 
 def _seconds(photo: Photo) -> float:

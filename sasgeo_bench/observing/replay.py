@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core import progress
 from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.flights.leap_seconds import is_date
 from sasgeo_bench.observing.fix_files import NS
 from sasgeo_bench.observing.flight_messages import Departure, GpsInput, Kind, Message, Origin, message_of
 
@@ -177,7 +178,7 @@ class _SimulatorClock:
             self.gap_s = now_s - self.heard_s
             self.pace = (boot_s - self.last_s) / self.gap_s
         self.last_s, self.heard_s = boot_s, now_s
-        self.unix_ns = round((unix_s - boot_s) * NS) if unix_s > 0 else None
+        self.unix_ns = round((unix_s - boot_s) * NS) if is_date(unix_s) else None
 
     def _now_s(self) -> float:
         """Return the simulator's second at this moment."""
@@ -328,6 +329,8 @@ class _Link:
         except ConnectionRefusedError:
             self.refused += 1
             return
+        except OSError as error:  # as of a route that was lost
+            raise self._unreachable(error) from error
         for message in self._mavlink.parse_buffer(data) or ():
             name = message.get_type()
             if name == "SYSTEM_TIME" and isinstance(self.clock, _SimulatorClock):

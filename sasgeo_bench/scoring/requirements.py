@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
 from functools import partial
 from typing import Annotated, Final, Literal, NamedTuple
 
@@ -45,7 +46,7 @@ _LIMIT: Final = re.compile(rf"\s*{_NUMBER}\s*(m|deg)\s*")
 _SHARE_WITHIN: Final = re.compile(rf"{_NUMBER}\s*%\s*within\s+(.+)")
 _LATENCY: Final = re.compile(rf"p{_NUMBER}\s+latency\s+{_NUMBER}\s*(ms|s)")
 _FIGURE: Final = re.compile(rf"([a-z][\w.]*)\s*(<=|>=)\s*{_NUMBER}\s*(\S*)")
-_UNITS: Final = {"": ("1", 1.0), "%": ("1", 0.01), "ms": ("s", 0.001)}  # as written -> of the metric, and times what
+_UNITS: Final = {"": ("1", 1), "%": ("1", 100), "ms": ("s", 1000)}  # as written -> of the metric, and how many make one
 _EXAMPLES: Final = (
     "'80% within 50 m', '50% within 5 m and 2 deg', 'p95 latency 400 ms', 'false <= 1%', or a metric as in "
     "'continuity_60s >= 99%'"
@@ -245,12 +246,12 @@ def _requirement(text: str) -> Requirement:
         figures = {LOCALIZATION: within_name(within_m, within_deg), SEQUENCE: _flown_name(within_m, within_deg)}
         return Requirement(text=text, bound=_share(match[1], what), is_least=True, figures=figures, own=own)
     if (match := _LATENCY.fullmatch(text)) is not None:
-        own = latency_metrics(float(match[2]) * (0.001 if match[3] == "ms" else 1.0))
+        own = latency_metrics(_divided(match[2], 1000 if match[3] == "ms" else 1))
         figures = dict.fromkeys(TRACKS, own[0].metric.name)
         return Requirement(text=text, bound=_share(match[1], what), is_least=True, figures=figures, own=own)
     if (match := _FIGURE.fullmatch(text)) is None:
         raise ConfigError(f"{what}, which is no requirement: say it as in {_EXAMPLES}")
-    name, is_least, value, unit = match[1], match[2] == ">=", float(match[3]), match[4]
+    name, is_least, unit = match[1], match[2] == ">=", match[4]
     if name == "false" and not is_least and unit == "%":
         return _of_false(text, _share(match[3], what))
     metric = _SHIPPED.get(name)
@@ -259,12 +260,18 @@ def _requirement(text: str) -> Requirement:
         known = f"did you mean {near[0]!r}?" if metric is None and near else f"say it as in {_EXAMPLES}"
         fault = "no metric" if metric is None else "a metric without an interval on each suite"
         raise ConfigError(f"{what}, and {name!r} is {fault}: {known}")
-    asked, times = _UNITS.get(unit, (unit, 1.0))
+    asked, parts = _UNITS.get(unit, (unit, 1))
     if asked != metric.unit:
         right = "a share, as in 90%" if metric.unit == "1" else f"in {metric.unit}"
         raise ConfigError(f"{what}, and {name} is {right}: give its unit")
+    bound = _divided(match[3], parts)
+    if not metric.bounds[0] <= bound <= metric.bounds[1]:
+        least, most = metric.bounds
+        raise ConfigError(
+            f"{what}, and {name} lies within {least:g} and {most:g}: give a bound that it may keep or miss"
+        )
     tracks = metric.tracks if isinstance(metric, MeanMetric) else _tracks_of(metric)
-    return Requirement(text=text, bound=value * times, is_least=is_least, figures=dict.fromkeys(tracks, name))
+    return Requirement(text=text, bound=bound, is_least=is_least, figures=dict.fromkeys(tracks, name))
 
 
 def _tracks_of(metric: QuantileMetric | ThresholdMetric) -> tuple[str, ...]:
@@ -274,7 +281,12 @@ def _tracks_of(metric: QuantileMetric | ThresholdMetric) -> tuple[str, ...]:
 def _share(text: str, what: str) -> float:
     if not 0 < float(text) <= 100:
         raise ConfigError(f"{what}: {text} is no share, which is above 0 and at most 100 %")
-    return float(text) / 100
+    return _divided(text, 100)
+
+
+def _divided(text: str, parts: int) -> float:
+    """Return the number nearest to a part of a decimal; 57 * 0.01 is more than 0.57, which a share of 57 % misses."""
+    return float(Decimal(text) / parts)
 
 
 def _of_false(text: str, bound: float) -> Requirement:

@@ -23,7 +23,8 @@ _EPOCH_S: Final = 2_082_844_800  # from 1904, whence QuickTime counts, to 1970
 _BOXES: Final = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")  # with which QuickTime and MP4 begin
 _MOST_HEAD: Final = 64 * 2**20  # of a moov box: an hour at 60 frames a second has 3 MB
 _CUT: Final = 0.95  # of the length that a head states; editors state a frame more or less
-_WITHIN: Final = (b"trak", b"mdia")  # boxes of a moov that hold others which are read
+_WITHIN: Final = (b"trak", b"mdia")  # boxes of a moov that hold others which are read, each in the one before
+_MOST_CREATED: Final = 2**32  # seconds since 1904, in 2040: more is no date
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,7 +216,7 @@ class _Head:
                 sizes = (4, wide, wide, 4, wide)  # version and flags, made, changed, units of a second, length
                 ends = np.cumsum(sizes).tolist()
                 parts = [int.from_bytes(body[end - size : end], "big") for size, end in zip(sizes, ends, strict=True)]
-                created_s = float(parts[1] - _EPOCH_S) if parts[1] > _EPOCH_S else None
+                created_s = float(parts[1] - _EPOCH_S) if _EPOCH_S < parts[1] < _MOST_CREATED else None
                 length_s = parts[4] / parts[3] if parts[3] and 0 < parts[4] < 2 ** (8 * wide) - 1 else None
             elif name == b"hdlr":
                 kinds.append(body[8:12])
@@ -242,7 +243,7 @@ def _boxes(file: IO[bytes]) -> Iterator[tuple[bytes, int, int]]:
         at += size
 
 
-def _inner(body: bytes) -> Iterator[tuple[bytes, bytes]]:
+def _inner(body: bytes, within: tuple[bytes, ...] = _WITHIN) -> Iterator[tuple[bytes, bytes]]:
     """Yield the boxes in a box, and those in its tracks."""
     at = 0
     while at + 8 <= len(body):
@@ -250,8 +251,8 @@ def _inner(body: bytes) -> Iterator[tuple[bytes, bytes]]:
         if size < 8:
             return
         inside = body[at + 8 : at + size]
-        if name in _WITHIN:
-            yield from _inner(inside)
+        if name in within[:1]:
+            yield from _inner(inside, within[1:])
         else:
             yield name, inside
         at += size

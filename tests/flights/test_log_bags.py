@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags of ROS: topics by their types, clocks of headers and of the recorder, and damaged files."""
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +164,15 @@ def test_a_bag_that_was_cut_off_is_refused_with_the_tool_that_mends_it(tmp_path:
     ) as fault:
         read_log(path)
     assert str(fault.value).isprintable()
+
+
+def test_a_bag_that_lost_the_messages_which_it_counts_is_refused_in_one_line(tmp_path: Path) -> None:
+    folder = bag(tmp_path / "folder.db3", mavros_messages(FLOWN))
+    with closing(sqlite3.connect(next(folder.glob("*.db3")))) as file:
+        file.execute("DELETE FROM messages")
+        file.commit()
+    with pytest.raises(FlightError, match=r"says that '/mavros/.*' has messages, and holds none: mend a bag"):
+        read_log(folder)
 
 
 @pytest.mark.parametrize("data", [b"", b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"PK" * 99])

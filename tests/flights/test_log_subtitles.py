@@ -218,3 +218,9 @@ def test_read_log_takes_subtitles_by_their_suffix(tmp_path: Path) -> None:
     assert read_log(path).lat_deg.tolist() == [47.140003, 47.140004]
     with pytest.raises(FlightError, match="leave out --time-unit"):
         read_log(path, LogFacts(time_unit="s"))
+
+
+def test_a_text_of_letters_without_end_is_passed_over(read: Written) -> None:
+    place = "[latitude: 47.14000#] [longitude: 9.520001] "
+    found = read([*two(place), place.replace("#", "5") + "a" * 1_000_000])  # by its square it would take hours
+    assert found.log.lat_deg.tolist() == [47.140003, 47.140004, 47.140005]

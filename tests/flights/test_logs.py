@@ -182,6 +182,13 @@ def test_a_gpx_track_starts_in_utc_and_does_not_say_which_sea_its_elevations_cou
     assert (bare.start_s, bare.altitude_m, bare.height_m) == (None, None, None)
 
 
+@pytest.mark.parametrize("year", ["1970", "2100"])
+def test_a_clock_that_was_not_set_tells_no_utc(written: Callable, year: str) -> None:
+    with pytest.warns(UserWarning, match="its clock was not set, as it tells no date from 1980 to 2038"):
+        log = read_log(written("a.gpx", _gpx(_points()).replace(f"<time>{START.year}", f"<time>{year}")))
+    assert (log.start_s, len(log)) == (None, 5)
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -60,6 +60,18 @@ def test_places_are_those_of_the_answers_and_headings_count_from_true_north(out,
         assert fix.p_false == pytest.approx(0.1)
 
 
+def test_a_view_without_an_answer_is_counted_and_the_odometer_leads_past_it(out, task, flight):
+    truths = flights_of(task)[flight]
+    run = run_of(out, task, lambda at, truth: None if at in (0, 3) else answer(truth), "holes")
+    found, whole = read_flight_fixes(run, flight=flight), run_of(out, task, lambda _, truth: answer(truth), "whole")
+    assert (found.views, len(found.fixes)) == (len(truths), len(truths) - 2)
+    assert found.begin_ns / NS == truths[0].measured["time_s"]
+    same = [
+        fix for fix in read_flight_fixes(whole, flight=flight).fixes if fix.name in {one.name for one in found.fixes}
+    ]
+    assert list(found.fixes) == same  # without a jump at the view that was left out
+
+
 def test_an_ellipse_turns_with_the_north_that_it_counts_from(out, task, flight):
     run = run_of(out, task, lambda _, truth: answer(truth), "ellipse")
     fix = read_flight_fixes(run, flight=flight).fixes[0]

@@ -153,6 +153,13 @@ def test_what_a_file_cannot_hold_is_refused_and_nothing_written(written, tmp_pat
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("begin_ns", [10 * NS, 4_112_848_800 * NS])  # 1970 and 2100
+def test_a_clock_that_was_not_set_gives_no_date(written, begin_ns):
+    flight = replace(invented().starting(begin_ns), clock="camera")
+    with pytest.raises(ConfigError, match="does not say when it began, and"):
+        written("a.mcap", flight=flight)
+
+
 def test_a_flight_without_a_date_has_seconds_since_its_first_view(written):
     flight = replace(invented(2, time_ns=[0, NS]), clock="flight", begin_ns=0)
     points = pyogrio.read_dataframe(written("a.geojson", flight=flight))

@@ -72,6 +72,12 @@ def test_an_offset_is_the_second_of_the_log_at_the_first_photo_whatever_the_cloc
         poses_by_log(log, found)
     places = {pose.name: pose.place[1] for pose in poses_by_log(log, found, offset_s=10.0).poses}
     assert places == pytest.approx({"a": LAT + 10 * STEP, "b": LAT + 15 * STEP}, abs=1e-7)
+    zones = {
+        "b": photo(tmp_path / "8.jpg", "1999:01:01 00:00:09", offset="-01:00"),
+        "a": photo(tmp_path / "9.jpg", "1999:01:01 02:00:02", offset="+01:00"),
+    }
+    places = {pose.name: pose.place[1] for pose in poses_by_log(log, zones, offset_s=10.0).poses}
+    assert places == pytest.approx({"a": LAT + 10 * STEP, "b": LAT + 17 * STEP}, abs=1e-7)
 
 
 def test_photos_that_the_log_does_not_tell_are_left_out_with_the_reason(tmp_path):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A flight sent over UDP: a listener finds the same fixes, times and ellipses; none of these tests measures time."""
 
+import socket
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,15 @@ from sasgeo_bench.observing.flight_messages import departures, message_of, origi
 from sasgeo_bench.observing.replay import ReplayRequest, Target, replay
 from tests.observing.flown import START_NS, invented
 from tests.observing.listening import ASKED_NS, FIRST_S, UNIX_S, Listener, silence
+
+
+class _Deaf(socket.socket):
+    """A socket that hears what it is told to."""
+
+    def __init__(self, *kind, recv):
+        super().__init__(*kind)
+        self.recv = recv
+
 
 FLIGHT = invented(6, is_jump=[False, False, True, False, False, False])
 SENT = departures(FLIGHT)
@@ -107,6 +117,16 @@ def test_where_nobody_listens_the_packets_that_were_refused_are_counted():
     assert 0 < report.refused <= report.packets
 
 
+def test_a_route_that_is_lost_on_the_way_is_one_line(monkeypatch):
+    def lost(*_):
+        raise OSError(113, "No route to host")
+
+    with Listener(is_simulator=True) as listener:
+        monkeypatch.setattr(replaying.socket, "socket", lambda *kind: _Deaf(*kind, recv=lost))
+        with pytest.raises(ConfigError, match=r"cannot be reached \(No route to host\): name another by --to"):
+            replay(request_to(listener.port, speed=1.0))
+
+
 def test_no_wait_adds_to_another(monkeypatch):
     """Each look at the clock costs 10 ms here and each wait 20 ms more than asked: no fix is later for those before."""
     pytest.importorskip("pymavlink")
@@ -144,9 +164,11 @@ def test_a_clock_of_a_simulator_stops_with_it_and_goes_on_after_a_new_start(monk
     assert clock.left_s(10.0) == pytest.approx(0.5)
     assert clock.stamp_ns(2.0) == 12 * NS
     assert clock.utc_ns(2.0) is None
-    clock.hear(1.0, 501.0)
+    clock.hear(1.0, UNIX_S)
     assert clock.left_s(4.0) == pytest.approx(0.0)
-    assert clock.utc_ns(4.0) == 501 * NS
+    assert clock.utc_ns(4.0) == UNIX_S * NS
+    clock.hear(2.0, 1e13)  # no week of GPS_INPUT is so far off
+    assert clock.utc_ns(4.0) is None
 
 
 @pytest.mark.parametrize(

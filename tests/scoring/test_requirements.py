@@ -88,6 +88,7 @@ def test_a_text_says_which_figure_must_be_how_large(text, bound, is_least, figur
         ("aurc <= 10%", "a metric without an interval on each suite"),
         ("position_p95 <= 30%", "position_p95 is in m: give its unit"),
         ("continuity_60s >= 10 s", "continuity_60s is a share, as in 90%: give its unit"),
+        ("continuity_60s >= 120%", "continuity_60s lies within 0 and 1: give a bound that it may keep or miss"),
     ],
 )
 def test_a_text_that_says_none_is_quoted_in_a_line_with_its_fault(text, fault):
@@ -96,6 +97,14 @@ def test_a_text_that_says_none_is_quoted_in_a_line_with_its_fault(text, fault):
     assert fault in str(raised.value)
     assert "\n" not in str(raised.value)
     assert repr(text) in str(raised.value)
+
+
+@pytest.mark.parametrize("percent", ["7", "57", "99.9"])
+def test_a_share_that_equals_the_bound_passes(percent):
+    reached = float(f"{percent}e-2")
+    for text in (f"{percent}% within 50 m", f"continuity_60s >= {percent}%", f"p{percent} latency 1 s"):
+        (one,) = parse_requirements([text])
+        assert one.verdict(reached, reached) == "passes", text
 
 
 @pytest.mark.parametrize("text", ["", "5", "5m,5m", "m", "5m;2deg", "-5m", "infm"])

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Videos: times of frames at any rate, what heads say, and files that are none."""
 
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,8 @@ def test_the_head_says_when_it_was_made_and_whether_it_holds_text(video: Path) -
     text = box(b"hdlr", bytes(8) + b"text" + bytes(13))
     changed(video, {}, more=box(b"trak", box(b"mdia", text)))
     assert Video.open(video).has_subtitles
+    changed(video, {b"mvhd": lambda body: b"\1" + body[1:4] + b"\xff" * 16 + body[12:] + bytes(12)})
+    assert Video.open(video).created_s is None  # of a version that counts to the end of days
 
 
 def test_a_video_that_is_cut_off_gives_the_frames_before(tmp_path: Path) -> None:
@@ -94,6 +97,10 @@ def test_what_is_no_video_is_refused_in_a_line(tmp_path: Path, video: Path, capf
         "cut.mp4": (whole[: len(whole) // 2], "is cut off, and its head at the end is missing"),
         "sound.mp4": (whole.replace(b"vide", b"soun"), "holds no pictures"),
         "codec.mp4": (whole.replace(b"stsd", b"none"), "cannot be decoded: it is damaged, or of a codec"),
+        "deep.mp4": (
+            box(b"ftyp", b"isom") + box(b"moov", reduce(lambda body, _: box(b"trak", body), range(3000), b"")),
+            "holds no pictures",
+        ),
         "damaged.avi": (b"RIFF\0\0\0\0AVI " + b"\0" * 500, "cannot be decoded"),
     }
     for name, (data, hint) in faults.items():

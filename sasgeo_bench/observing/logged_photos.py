@@ -2,6 +2,7 @@
 """Poses of photos by the log of the flight on which they were taken, joined by time."""
 
 import datetime as dt
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,10 +17,12 @@ from sasgeo_bench.core.errors import FlightError, PoseError, SasgeoError, counte
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_points import AltitudeOf as LogAltitudeOf
 from sasgeo_bench.observing.picture_poses import AltitudeOf, PicturePose, PoseTable
+from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M
 from sasgeo_bench.observing.tracks import LOOKS_DOWN, Moment, Track, read_track
 from sasgeo_bench.sensing.photos import Photo, read_photo
 
 _WGS84: Final = pyproj.Geod(ellps="WGS84")
+_SECOND: Final = math.sqrt(1 / 6)  # s, standard deviation of the difference of two times that count whole seconds
 _FAR_M: Final = 50.0  # no receiver is as far off
 _ALTITUDES: Final[Mapping[LogAltitudeOf, AltitudeOf]] = MappingProxyType(
     {"geoid": "sea", "ellipsoid": "ellipsoid", "unknown": "unstated"}
@@ -68,14 +71,19 @@ def poses_by_log(log: Path, photos: Mapping[str, Path], *, offset_s: float | Non
         else:
             taken[name] = photo
     times_s = _in_log(track, taken, offset_s)
-    poses = []
+    is_coarse = not any(photo.taken_at.microsecond for photo in taken.values() if photo.taken_at is not None)
+    if is_coarse and offset_s is None:  # a clock that counts seconds is late by half of one on average
+        times_s = {name: time_s + 0.5 for name, time_s in times_s.items()}
+    poses, blurs_m = [], []
     for name, time_s in times_s.items():
         moment = track.at(time_s)
         if isinstance(moment, str):
             left_out[moment].append(name)
         else:
             has_gimbal = taken[name].gimbal is not None
-            poses.append(_pose(name, replace(moment, camera=None) if has_gimbal else moment, track, time_s))
+            blur_m = _SECOND * _speed_mps(track, time_s) if is_coarse else 0.0
+            blurs_m.append(blur_m)
+            poses.append(_pose(name, replace(moment, camera=None) if has_gimbal else moment, track, time_s, blur_m))
     if not poses:
         why = "; ".join(f"{named([plain(name) for name in names], 'photo')} {why}" for why, names in left_out.items())
         mend = ": if a clock is wrong, say --offset" if times_s and offset_s is None else ""
@@ -85,6 +93,7 @@ def poses_by_log(log: Path, photos: Mapping[str, Path], *, offset_s: float | Non
     is_looked_up = any(pose.attitude is not None for pose in poses)
     notes = (
         f"the first of {counted(len(times_s), 'photo')} was taken {first:.1f} s after the log begins, {how}",
+        *([f"times of photos count whole seconds: places are off by {max(blurs_m):.1f} m more"] if is_coarse else []),
         *_apart(poses, taken),
         *(note for note in track.notes if is_looked_up or note != LOOKS_DOWN),
     )
@@ -136,7 +145,13 @@ def _seconds(photo: Photo) -> float:
     return photo.taken_at.replace(tzinfo=dt.UTC).timestamp()
 
 
-def _pose(name: str, moment: Moment, track: Track, time_s: float) -> PicturePose:
+def _speed_mps(track: Track, time_s: float) -> float:
+    """Return how fast the drone was around a time of the log."""
+    ends = [one for one in (track.at(time_s - 0.5), track.at(time_s + 0.5)) if not isinstance(one, str)]
+    return float(_WGS84.inv(*ends[0].lonlat, *ends[1].lonlat)[2]) if len(ends) > 1 else 0.0
+
+
+def _pose(name: str, moment: Moment, track: Track, time_s: float, blur_m: float) -> PicturePose:
     log = track.log
     return PicturePose(
         name=name,
@@ -147,5 +162,5 @@ def _pose(name: str, moment: Moment, track: Track, time_s: float) -> PicturePose
         attitude=moment.camera,
         time_s=time_s if log.start_s is None else log.start_s + time_s,
         clock="own" if log.start_s is None else "utc",
-        sigma_m=track.sigma_m,
+        sigma_m=round(math.hypot(track.sigma_m or GPS_SIGMA_M, blur_m), 2) if blur_m else track.sigma_m,
     )

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photos get their poses from the log of their flight: joined by UTC, or by the second of the log that is stated."""
 
+import math
+
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
@@ -8,9 +10,10 @@ from PIL import ExifTags, Image
 from sasgeo_bench.core.errors import ConfigError, FlightError, PoseError
 from sasgeo_bench.observing.import_photos import ImportRequest
 from sasgeo_bench.observing.logged_photos import poses_by_log
+from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M
 from tests.sensing.test_photos import write_photo, xmp_of
 
-LON, LAT, STEP = 9.52, 47.14, 1e-4
+LON, LAT, STEP = 9.5200013, 47.1400017, 1e-4  # of as many digits as a receiver has
 
 
 def log_of(path, *, gap=(), clock="2025-05-01T10:00:{:06.3f}Z"):
@@ -129,3 +132,18 @@ def test_a_log_that_does_not_say_utc_needs_an_offset_and_a_table_beside_it_is_re
     assert np.isclose(poses_by_log(log, found, offset_s=3.0).poses[0].place[1], LAT + 3 * STEP)
     with pytest.raises(ConfigError, match="give --poses or --track alone"):
         ImportRequest(pictures=tmp_path, region=tmp_path, out=tmp_path, poses=log, log=log)
+
+
+def test_a_clock_that_counts_whole_seconds_costs_half_of_one_and_is_told(tmp_path):
+    log = log_of(tmp_path / "log.csv")
+    found = {"a": photo(tmp_path / "a.jpg", "2025:05:01 12:00:12")}
+    table = poses_by_log(log, found)
+    (pose,) = table.poses
+    assert pose.place[1] == pytest.approx(LAT + 12.5 * STEP, abs=1e-7)
+    way_m = STEP * 111_180  # of a second, which is truncated in the photo
+    assert pose.sigma_m == pytest.approx(math.hypot(GPS_SIGMA_M, way_m / math.sqrt(6)), abs=0.02)
+    assert any("count whole seconds" in note for note in table.notes)
+    both = found | {"b": photo(tmp_path / "b.jpg", "2025:05:01 12:00:14", part="5")}
+    first, second = poses_by_log(log, both).poses
+    assert [one.place[1] for one in (first, second)] == pytest.approx([LAT + at * STEP for at in (12, 14.5)], abs=1e-7)
+    assert first.sigma_m is None

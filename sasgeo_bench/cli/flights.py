@@ -30,7 +30,7 @@ from sasgeo_bench.flights.trajectory import Axes, Trajectory, read_tum, write_tu
 from sasgeo_bench.regions.region_files import MANIFEST, read_manifest, read_region
 from sasgeo_bench.scoring.gnss_check import IN_A_ROW, SHARE, SIGMA_M, Monitor, check_gnss, summary
 from sasgeo_bench.tasks.query import TRUTH_SIGMA, PriorGroup
-from sasgeo_bench.tasks.task_files import Task
+from sasgeo_bench.tasks.task_files import TASK, Task
 
 AxesFlag = Annotated[
     Axes | None,
@@ -151,7 +151,7 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
                 options.say(line)
         return ()
     # Half a second, which who only asks what a log holds need not wait for.
-    from sasgeo_bench.tasks.build import make_tasks  # noqa: PLC0415
+    from sasgeo_bench.tasks.build import made_tasks, make_tasks  # noqa: PLC0415
     from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests  # noqa: PLC0415
 
     flown = options.flown
@@ -168,7 +168,15 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
         flown=flown,
     )
     (request,) = plan_requests(wanted)
+    suite = request.found
+    before = options.out / "tasks" / request.suite / request.region.id
+    if (before / TASK).is_file() and made_tasks(request) is None:
+        tell(f"{before} holds the queries of another flight or request, which are replaced (another --out keeps both)")
     tasks = make_tasks(request)
+    kinds = ", ".join(dict.fromkeys(f"{variant.kind} ({variant.role})" for variant in suite.variants))
+    tell(f"the flight is asked once for each of: {kinds}")
+    if not suite.is_pictured:
+        tell(f"views of {request.suite} are {suite.main_side_m:g} m wide, whatever the height of the flight")
     for task in tasks:
         options.say(task.folder)
     if options.tum is not None:
@@ -210,7 +218,8 @@ def check_gnss_command(options: GnssOptions) -> None:
     if not cases.flights:
         raise FlightError(f"{options.run} has no flights: name a run of a tracker on a task of flights")
     table = Table(
-        *("suite", "region", "flights", "fixes", "false alarms / h", "pull-off, m/s", "noticed", "after s: p50", "p95"),
+        *("suite", "region", "flights", "hours", "fixes", "false alarms / h", "at most (95 %)"),
+        *("pull-off, m/s", "noticed", "after s: p50", "p95"),
         box=None,
         pad_edge=False,
     )
@@ -234,7 +243,8 @@ def check_gnss_command(options: GnssOptions) -> None:
             fixes = sum(one.fixes for one in checks)
             times_s = (figures["notice_p50_s"], figures["notice_p95_s"])
             table.add_row(
-                *(suite, region, str(len(groups)), str(fixes), f"{figures['alarms_per_hour']:.2f}", f"{speed_mps:g}"),
+                *(suite, region, str(len(groups)), f"{figures['hours']:.2g}", str(fixes)),
+                *(f"{figures['alarms_per_hour']:.2f}", f"{figures['alarms_per_hour_at_most']:.2f}", f"{speed_mps:g}"),
                 f"{figures['noticed']:.0%}",
                 *("never" if time == math.inf else f"{time:.0f}" for time in times_s),
             )
@@ -362,6 +372,8 @@ def _lines(log: FlightLog, speed_mps: float) -> Iterator[str]:
         if values is not None:
             what, _, unit = name.partition("_")
             yield f"{what} from {values.min():.1f} to {values.max():.1f} {unit}"
+    lon, lat = log.lon_deg, log.lat_deg
+    yield f"longitude from {lon.min():.4f} to {lon.max():.4f}, latitude from {lat.min():.4f} to {lat.max():.4f} deg"
     if log.time_s is None:
         tell(f"no times: a flight has an even speed (--speed-mps, {speed_mps:g} m/s)")
     if log.height_m is None:

@@ -187,14 +187,20 @@ def check_gnss(
 def summary(checks: Sequence[GnssCheck]) -> dict[str, float]:
     """Return figures over flights: alarms an hour, the share that is noticed, and how soon (median, 95 %).
 
-    Pull-offs that nobody notices count as infinite.
+    Pull-offs that nobody notices count as infinite. "At most" is the upper end of a Poisson count at 95 %, one-sided,
+    as if all hours were independent; flights of one log are one path.
 
     >>> one = GnssCheck(fixes=9, hours=0.5, alarms_s=(3.0,), noticed_s=(10.0, 20.0, np.inf))
-    >>> summary([one])
-    {'alarms_per_hour': 2.0, 'noticed': 0.667, 'notice_p50_s': 20.0, 'notice_p95_s': inf}
+    >>> figures = summary([one])
+    >>> figures["alarms_per_hour"], figures["alarms_per_hour_at_most"], figures["noticed"], figures["notice_p95_s"]
+    (2.0, 9.488, 0.667, inf)
     """
-    hours = sum(one.hours for one in checks)
-    found = {"alarms_per_hour": round(sum(len(one.alarms_s) for one in checks) / hours, 3) if hours else np.nan}
+    hours, alarms = sum(one.hours for one in checks), sum(len(one.alarms_s) for one in checks)
+    found = {
+        "alarms_per_hour": round(alarms / hours, 3) if hours else np.nan,
+        "alarms_per_hour_at_most": round(float(chi2.ppf(0.95, 2 * alarms + 2)) / 2 / hours, 3) if hours else np.nan,
+        "hours": round(hours, 3),
+    }
     times = np.array([time for one in checks for time in one.noticed_s])
     if len(times):
         p50, p95 = np.quantile(times, [0.5, 0.95], method="inverted_cdf").tolist()

@@ -180,7 +180,10 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
     suite = replace(suite, variants=suite.usable(scene))
     if isinstance(suite, FlightSuite):
         over = base if scene.pictured is None else base.within(scene.pictured.footprint)
-        flown = None if request.flown is None else request.flown.over(over, margin_m=suite.clear_m(scene))
+        flown = None
+        if request.flown is not None:
+            flown = request.flown.over(over, margin_m=suite.clear_m(scene))
+            seeds = seeds.under("flown", request.flown.key)  # another log has other ids: no answer fits both
         airspace = Airspace(
             region=over,
             scene=scene,

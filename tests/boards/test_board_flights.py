@@ -291,11 +291,12 @@ def test_the_receiver_is_checked_by_the_fixes_of_a_run(out, program, mistake):
     assert code == 0, err
     rows = [line.split() for line in printed.splitlines()[1:] if line.strip()]
     assert [row[:3] for row in rows] == [[SUITE, REGION, "6"]] * 2
-    assert [row[4] for row in rows] == ["0.00"] * 2  # false alarms: its fixes are 3 m off
-    assert rows[1][6] == "100%"
+    assert [row[5] for row in rows] == ["0.00"] * 2  # false alarms: its fixes are 3 m off
+    assert float(rows[0][6]) == pytest.approx(2.996 / float(rows[0][3]), rel=0.05)  # the rule of three
+    assert rows[1][8] == "100%"
     # fixes that are accepted 40 m off alarm every flight
     printed = program("check-gnss", str(out / "runs" / "far"), "--out", str(out))[1]
-    assert float(printed.splitlines()[1].split()[4]) > 0
+    assert float(printed.splitlines()[1].split()[5]) > 0
     assert "--pull-off must be positive metres a second" in mistake(
         "check-gnss", out / "runs" / "near", "--pull-off", "0"
     )

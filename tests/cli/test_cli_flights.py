@@ -116,6 +116,7 @@ def test_what_is_read_of_a_log_is_printed_with_its_columns_and_units(program, tm
         "yaw: 'heading_deg', deg",
         "height from 100.0 to 100.0 m",
         "yaw from 90.0 to 90.0 deg",
+        "longitude from 11.0010 to 11.0013, latitude from 49.0050 to 49.0050 deg",
     ]
 
 
@@ -130,7 +131,7 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
     words[words.index("--height-unit") : words.index("--height-unit") + 2] = ["--height", "80"]
     _, out, err = program("import-flight", "log.csv", *words)
     assert err == ""  # its heights are not asked for
-    assert out.splitlines()[-3:] == [
+    assert out.splitlines()[-4:-1] == [
         "not read: 'height', 'heading'",
         "height: 80 m throughout, as --height says",
         "height from 80.0 to 80.0 m",
@@ -245,6 +246,7 @@ def test_what_is_read_of_the_log_of_an_autopilot_is_printed_with_its_messages(pr
         "yaw from 0.0 to 359.5 deg",
         "pitch from 0.0 to 0.0 deg",
         "roll from 0.0 to 0.0 deg",
+        "longitude from 9.5200 to 9.5230, latitude from 47.1400 to 47.1420 deg",
     ]
 
 

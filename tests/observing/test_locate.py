@@ -87,6 +87,7 @@ def test_a_drawn_picture_is_found_where_it_was_drawn(located, crop):
     assert fix.p_false <= 0.1
 
 
+@pytest.mark.slow
 def test_frames_of_a_video_are_found_where_they_were_drawn(towns: Path, crop, tmp_path):
     """A second of one picture, from so high that its pixels are as wide, with what a DJI writes beside it."""
     manifest = sgb.read_region(towns / "regions" / TOWN).manifest

@@ -70,6 +70,7 @@ def test_a_map_of_no_task_is_refused(tasks, aboard, tmp_path):
         plan_run(RunRequest(spec="random", tasks=[task], out=out, maps=maps))
 
 
+@pytest.mark.slow
 def test_who_looks_at_imagery_is_not_asked_on_a_map_packed_without(aboard):
     out, task = aboard
     one = unpack_map(out / f"{TOWN}.map", out)
@@ -116,6 +117,7 @@ def test_what_was_learned_travels_with_the_map_and_ties_the_same_answers(program
     assert (flown / "counts" / after.hash / after.learned.file).read_bytes() == one.learned.read_bytes()
 
 
+@pytest.mark.slow
 def test_another_matcher_leaves_the_weights_alone(tasks, aboard, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     out, task = aboard

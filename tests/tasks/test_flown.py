@@ -70,6 +70,7 @@ def test_the_views_lie_along_the_log_in_its_order_and_head_where_it_flies(root, 
             assert abs((pose.yaw_deg - expected + 180) % 360 - 180) < 2.0
 
 
+@pytest.mark.slow
 def test_a_log_that_tells_the_date_tells_when_each_view_was_flown(root, tmp_path):
     epsg, way_m = read_manifest(root / "regions" / TOWN).epsg, corners(root)
     log = log_of(tmp_path / "log.csv", way_m, epsg, start="2025-05-01T10:00:00")

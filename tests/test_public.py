@@ -122,6 +122,8 @@ SLOW = {"pandas", "geopandas", "rasterio", "pyproj", "pyarrow.compute", "pyarrow
         ("sasgeo_bench.cli.doors", {"numpy", "pandas", "pydantic"}),
         ("sasgeo_bench.cli.regions", {"matplotlib", "scipy.optimize"}),
         ("sasgeo_bench.tasks.build", {"matplotlib", "scipy.interpolate", "scipy.signal", "scipy.stats"}),
+        ("sasgeo_bench.cli.observing", {"geopandas", "pandas", "sklearn", "scipy.stats"}),
+        ("sasgeo_bench.sasgeo.variants", {"matplotlib", "sklearn", "scipy.stats"}),
         ("sasgeo_baselines.map_density_prior", {"pandas", "scipy"}),
     ],
 )

@@ -22,7 +22,7 @@ from sasgeo_bench.observing.masks import read_legend
 from sasgeo_bench.observing.photo_flights import OdometerName
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights
-from sasgeo_bench.observing.video import is_video
+from sasgeo_bench.sensing.video import is_video
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.task_files import Task
 

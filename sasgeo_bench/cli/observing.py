@@ -21,8 +21,8 @@ from sasgeo_bench.observing.fixes import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTE
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results
-from sasgeo_bench.observing.video import EVERY_S, VideoRequest, is_video, video_photos
 from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
+from sasgeo_bench.sensing.video import EVERY_S, is_video
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
 _PAIR: Final = re.compile(r"\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*,\s*([+-]?[0-9]+(?:\.[0-9]+)?)\s*")
@@ -56,6 +56,9 @@ class VideoOptions(Options):
         if not is_video(pictures):
             self.check_of_video("track", "every", "fov", "offset")
             return pictures
+        # Pictures need no reader of logs, which takes 40 MB.
+        from sasgeo_bench.observing.video import VideoRequest, video_photos  # noqa: PLC0415
+
         request = VideoRequest(
             path=pictures,
             out=out,

@@ -30,11 +30,10 @@ from sasgeo_bench.observing.tracks import Moment, Track, read_track
 from sasgeo_bench.observing.video_motion import NEAR_S, STEP_S, Begin, Headings, MotionSeen, find_begin, find_headings
 from sasgeo_bench.sensing.camera import Attitude
 from sasgeo_bench.sensing.photos import Lens
-from sasgeo_bench.sensing.video import SUFFIXES, Due, Video
+from sasgeo_bench.sensing.video import EVERY_S, Due, Video
 
 Floats = NDArray[np.float64]
 
-EVERY_S: Final = 2.0
 FRAMES: Final = "frames"  # folder below the root of outputs
 
 _RECORD: Final = "frames.json"
@@ -91,15 +90,6 @@ class VideoRequest:
             raise ConfigError(f"--fov, the horizontal field of view, lies within 5 and 115 deg, got {self.fov_deg!r}")
         if self.offset_s is not None and not abs(self.offset_s) <= 1e6:
             raise ConfigError(f"--offset is seconds of the track at which the video begins, got {self.offset_s!r}")
-
-
-def is_video(path: Path) -> bool:
-    """Return whether a path is named as a video is.
-
-    >>> is_video(Path("DJI_0001.MP4")), is_video(Path("DJI_0001.JPG"))
-    (True, False)
-    """
-    return path.suffix.lower() in SUFFIXES and not path.is_dir()
 
 
 def video_photos(request: VideoRequest) -> Path:

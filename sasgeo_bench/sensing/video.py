@@ -16,6 +16,7 @@ from sasgeo_bench.core.errors import ImageError
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import message_of
 
+EVERY_S: Final = 2.0  # between frames that are looked at
 SUFFIXES: Final = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".ts", ".mts", ".m2ts")
 
 _MOST_PIXELS: Final = 200_000_000
@@ -25,6 +26,15 @@ _MOST_HEAD: Final = 64 * 2**20  # of a moov box: an hour at 60 frames a second h
 _CUT: Final = 0.95  # of the length that a head states; editors state a frame more or less
 _WITHIN: Final = (b"trak", b"mdia")  # boxes of a moov that hold others which are read, each in the one before
 _MOST_CREATED: Final = 2**32  # seconds since 1904, in 2040: more is no date
+
+
+def is_video(path: Path) -> bool:
+    """Return whether a path is named as a video is.
+
+    >>> is_video(Path("DJI_0001.MP4")), is_video(Path("DJI_0001.JPG"))
+    (True, False)
+    """
+    return path.suffix.lower() in SUFFIXES and not path.is_dir()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,8 +20,9 @@ from sasgeo_bench.core.errors import ConfigError, FlightError, ImageError, Sasge
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.observing.pictures import list_pictures, open_picture, see
 from sasgeo_bench.observing.posed_pictures import Heights, pose_pictures
-from sasgeo_bench.observing.video import VideoRequest, is_video, video_photos
+from sasgeo_bench.observing.video import VideoRequest, video_photos
 from sasgeo_bench.sensing.photos import read_head, read_photo
+from sasgeo_bench.sensing.video import is_video
 from tests.flights.test_log_subtitles import block
 from tests.observing.test_video_motion import STEP_S, log_of, seen_frames, straight, winding
 from tests.videos import box, changed, made_at, number_of, numbered, write_video

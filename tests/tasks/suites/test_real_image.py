@@ -272,6 +272,7 @@ def test_places_of_sites_follow_no_lattice(village):
     assert (np.histogram2d(*phases.T, bins=2, range=[(0, 1), (0, 1)])[0] > 0.12 * len(sites)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_a_picture_of_half_a_region_carries_as_many_sites_as_are_asked_for(real_extracts, tmp_path):
     spec = read_region_file(list_region_files()["pardubice-ortho"])

@@ -2,6 +2,7 @@
 """Logs of autopilots as tests write them: one flight, in every format, with what each format has besides."""
 
 import struct
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +10,9 @@ from pathlib import Path
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
+
+from sasgeo_bench.core.errors import FlightError
+from sasgeo_bench.flights.logs import read_log
 
 LON, LAT = 9.52, 47.14
 START_S = 1_746_093_600  # 2025-05-01 10:00 UTC
@@ -397,3 +401,23 @@ def fusing(is_fused: Callable[[float], bool], *, every_s: float = 0.5) -> tuple[
     times_s = np.arange(0, LEVEL.time_s[-1], every_s)
     rows = [(us, OTHERS | _GPS_BIT * is_fused(one)) for us, one in zip(stamps_us(times_s), times_s, strict=True)]
     return STATUS, rows
+
+
+def wrong_of_damaged(path: Path, data: bytes, *, seed: int, part: float) -> list[str]:
+    """Change five bytes of a log, cut it, and read it; return what is wrong with what is read, or with the refusal."""
+    changed, rng = bytearray(data), np.random.default_rng(seed)
+    for at in rng.integers(len(data), size=5):
+        changed[at] = rng.integers(256)
+    path.write_bytes(bytes(changed[: round(len(data) * part)]))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            log = read_log(path)
+    except FlightError as fault:
+        line = str(fault)
+        return [] if path.name in line and line.isprintable() else [line]
+    most = {"lon_deg": 180, "lat_deg": 90, "height_m": 1e4, "altitude_m": 1e30, "yaw_deg": 360, "pitch_deg": 90}
+    columns = {name: getattr(log, name) for name in most if getattr(log, name) is not None}
+    wrong = [name for name, values in columns.items() if not (np.abs(values) <= most[name]).all()]
+    wrong += [name for name, values in columns.items() if len(values) != len(log)]
+    return wrong if log.time_s is not None and (np.diff(log.time_s) > 0).all() else [*wrong, "time_s"]

@@ -37,6 +37,7 @@ MOST_BYTES: Final = 256 * 2**20  # of text, where a million points with names an
 MOST_POINTS: Final = 1_000_000
 BEFORE_FIX: Final = "at 0, 0 before the first fix"
 
+_HIGHEST_ALTITUDE_M: Final = HIGHEST_M + 9_000.0  # above the highest ground
 _MOST_SHOWN: Final = 40  # characters of a text out of a file
 _ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
 _MOST_NAMES: Final = 12  # in a message
@@ -175,7 +176,7 @@ class FlightLog:
         if len(numbers) < 2:  # a way
             raise source.fault(f"a flight has two points at least, the log has {len(numbers)}: export more of it")
         _check_times(source, numbers, columns)
-        for name, most in {**_ANGLES, "height_m": HIGHEST_M}.items():
+        for name, most in {**_ANGLES, "height_m": HIGHEST_M, "altitude_m": _HIGHEST_ALTITUDE_M}.items():
             if name in columns:
                 _check_size(source, numbers, columns[name], name, most, names.get(name, name.partition("_")[0]))
         if start_s is not None and not is_date(start_s):

@@ -416,7 +416,7 @@ def wrong_of_damaged(path: Path, data: bytes, *, seed: int, part: float) -> list
     except FlightError as fault:
         line = str(fault)
         return [] if path.name in line and line.isprintable() else [line]
-    most = {"lon_deg": 180, "lat_deg": 90, "height_m": 1e4, "altitude_m": 1e30, "yaw_deg": 360, "pitch_deg": 90}
+    most = {"lon_deg": 180, "lat_deg": 90, "height_m": 1e4, "altitude_m": 1.9e4, "yaw_deg": 360, "pitch_deg": 90}
     columns = {name: getattr(log, name) for name in most if getattr(log, name) is not None}
     wrong = [name for name, values in columns.items() if not (np.abs(values) <= most[name]).all()]
     wrong += [name for name, values in columns.items() if len(values) != len(log)]

@@ -584,3 +584,12 @@ def test_what_altitudes_do_not_tell_is_refused(written, region, name, facts, wor
     }
     with pytest.raises(FlightError, match=words):
         read_flight(written(name, texts[name]), region, facts=LogFacts(**facts))
+
+
+@pytest.mark.parametrize("altitude", ["-8.3e127", "19001", "1e400"])
+def test_an_altitude_that_none_can_be_is_refused_with_its_point_or_left_out(written, altitude) -> None:
+    text = _gpx(_points()).replace("<time>", "<ele>480</ele><time>").replace("<ele>480", f"<ele>{altitude}", 1)
+    if altitude == "1e400":  # no number: those of all points are left out
+        assert read_log(written("a.gpx", text)).altitude_m is None
+    else:
+        assert "altitude is" in _refused(written("a.gpx", text))

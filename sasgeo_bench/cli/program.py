@@ -132,7 +132,7 @@ class _Group(TyperGroup):
         """Write the commands in the groups of the work."""
         for group, names in COMMANDS.items():
             with formatter.section(group):
-                formatter.write_dl([(name, (self.commands[name].help or "").partition("\n\n")[0]) for name in names])
+                formatter.write_dl([(name, help_of(file, name).partition("\n\n")[0]) for name, file in names.items()])
 
 
 def spelled_out(words: Sequence[str], params: Sequence[Any]) -> list[str]:
@@ -233,8 +233,8 @@ def _program(
 
 
 for _commands in COMMANDS.values():
-    for _name, _file in _commands.items():
-        app.command(_name, help=help_of(_file, _name))(lambda: None)
+    for _name in _commands:
+        app.command(_name)(lambda: None)
 
 
 def _warn(

@@ -6,6 +6,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Final
 
+import cv2
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
@@ -113,7 +114,10 @@ def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
     side_m = (cols * _cell_m(manifest, overview), rows * _cell_m(manifest, overview))
     west_m, _, _, north_m = manifest.bounds_m
     extent = (west_m, west_m + side_m[0], north_m - side_m[1], north_m)  # what fills no whole cell lies south and east
-    chart.imshow(paint_overview(manifest, overview), extent=extent, interpolation="antialiased")
+    # With an alpha of its own matplotlib draws it in a third of the memory
+    picture = cv2.cvtColor(paint_overview(manifest, overview), cv2.COLOR_RGB2RGBA)
+    is_smaller = max(rows, cols) > _MAP_INCHES * _DPI
+    chart.imshow(picture, extent=extent, interpolation="antialiased" if is_smaller else "nearest")
     chart.set_anchor("NW")
     west, south, east, north = manifest.bounds_m
     frame = shapely.boundary(shapely.box(west, south, east, north))
@@ -156,21 +160,21 @@ def _cell_m(manifest: Manifest, overview: NDArray[np.uint8]) -> float:
     return manifest.cell_size_m * round(manifest.cols / overview.shape[2]) if overview.shape[2] else 1.0
 
 
-def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the colours of a map, shape (rows, cols, 3), 0..1."""
+def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the colours of a map, red, green and blue, shape (rows, cols, 3)."""
     rows, cols = overview.shape[1:]
-    picture = np.empty((rows, cols, 3))
-    picture[:] = to_rgb(GROUND)
-    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
+    number = np.zeros((rows, cols), dtype=np.uint8)  # of a colour
+    colours = [GROUND]
     for name in PAINT_ORDER:
         if name in manifest.classes:
-            picture[overview[manifest.classes.index(name)] == PRESENT] = colours[name]
-    outside = overview[0] == OUTSIDE
+            number[overview[manifest.classes.index(name)] == PRESENT] = len(colours)
+            colours.append(load_taxonomy()[name].colour)
     down, right = np.indices((rows, cols), sparse=True)
     is_stripe = (down + right) // _STRIPE_CELLS % 2 == 0
-    picture[outside] = to_rgb(_UNMAPPED[0])
-    picture[outside & is_stripe] = to_rgb(_UNMAPPED[1])
-    return picture
+    outside = overview[0] == OUTSIDE
+    number[outside] = (len(colours) + is_stripe)[outside]
+    palette = np.rint(255 * np.array([to_rgb(colour) for colour in (*colours, *_UNMAPPED)]))
+    return palette.astype(np.uint8)[number]
 
 
 def paint_evidence(evidence: Evidence) -> NDArray[np.float64]:

@@ -174,7 +174,7 @@ def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[n
     outside = overview[0] == OUTSIDE
     number[outside] = (len(colours) + is_stripe)[outside]
     palette = np.rint(255 * np.array([to_rgb(colour) for colour in (*colours, *_UNMAPPED)]))
-    return palette.astype(np.uint8)[number]
+    return np.asarray(palette.astype(np.uint8)[number])
 
 
 def paint_evidence(evidence: Evidence) -> NDArray[np.float64]:

@@ -111,10 +111,11 @@ def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.ui
     beyond = (~is_there).astype(np.uint8)
     if reaches[-1] > _WIDE:
         distance = cv2.distanceTransform(beyond, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        return beyond + sum((distance > reach).view(np.uint8) for reach in reaches)
-    marked = is_there.view(np.uint8)
+        for reach in reaches:
+            beyond += distance > reach
+        return beyond
     for reach in reaches:
-        beyond += 1 - np.asarray(cv2.dilate(marked, round_kernel(reach)))
+        beyond += np.asarray(cv2.dilate(is_there.view(np.uint8), round_kernel(reach))) == 0
     return beyond
 
 

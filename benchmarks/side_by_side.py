@@ -16,6 +16,7 @@ Faroes in a folder that SASGEO_EXTRACTS names.
 import argparse
 import json
 import os
+import re
 import shutil
 import statistics
 import subprocess
@@ -29,30 +30,10 @@ from typing import Final
 HERE: Final = Path(__file__).resolve().parents[1]
 FRESH: Final = "{fresh}"  # a folder that is emptied before each run
 KEPT: Final = "{kept}"  # a folder of the commit, in which its regions and tasks stay
-SQUARE: Final = """
-id = "square"
-title = "Around Vaduz"
-scenes = ["suburban"]
-center_lonlat = [9.522, 47.15]
-size_m = [12288, 12288]
-cell_size_m = 1.0
-
-[[extract]]
-file = "liechtenstein-2025-09-19.osm.pbf"
-date = 2025-09-19
-"""
-FAROES: Final = """
-id = "faroes"
-title = "Faroes"
-scenes = ["coastal"]
-center_lonlat = [-6.97, 61.895]
-size_m = [81920, 120832]
-cell_size_m = 1.0
-
-[[extract]]
-file = "faroe-2017-02-18.osh.pbf"
-date = 2017-02-18
-"""
+PLACES: Final = {  # name -> region whose extracts it has, and what its file says otherwise
+    "square": ("vaduz", {"id": '"square"', "size_m": "[12288, 12288]"}),
+    "faroes": ("torshavn", {"id": '"faroes"', "center_lonlat": "[-6.97, 61.895]", "size_m": "[81920, 120832]"}),
+}
 VADUZ: Final = ("build-region", "vaduz", "--out", KEPT)
 
 
@@ -138,11 +119,15 @@ class Checkout:
         if not made.root.exists():
             git("worktree", "add", "--force", "--detach", str(made.root), commit)
         if not (made.root / ".venv" / "installed").exists():
-            subprocess.run(["make", "install"], cwd=made.root, check=True, stdout=subprocess.DEVNULL)  # noqa: S607
+            with (into / f"{name}.log").open("ab") as said:
+                subprocess.run(["make", "install"], cwd=made.root, check=True, stdout=said, stderr=said)  # noqa: S607
             (made.root / ".venv" / "installed").touch()
         made.kept.mkdir(exist_ok=True)
-        (made.kept / "square.toml").write_text(SQUARE)
-        (made.kept / "faroes.toml").write_text(FAROES)
+        for place, (region, changes) in PLACES.items():
+            text = (HERE / "regions" / f"{region}.toml").read_text()
+            for key, value in changes.items():
+                text = re.sub(f"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
+            (made.kept / f"{place}.toml").write_text(text)
         return made
 
     @property

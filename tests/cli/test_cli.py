@@ -144,6 +144,15 @@ def test_the_towns_of_the_demo_are_a_line_and_your_own_are_listed_whatever_their
     assert "and 36 small towns of `leaderboard demo`, demo-..." in err
 
 
+def test_what_new_region_wrote_is_listed_without_a_word_about_it(program, tmp_path):
+    (tmp_path / "my-regions").mkdir()  # where new-region writes, in the folder that a program runs in
+    small_town(tmp_path / "my-regions", **{'id = "town-suburb"': 'id = "mine"'}).rename(
+        tmp_path / "my-regions/mine.toml"
+    )
+    listed = program("list", "regions")[1].split()
+    assert {"mine", "vaduz"} <= set(listed)
+
+
 def test_inspect_draws_a_map_that_was_built_on_the_way_to_queries(program, tmp_path):
     spec = read_region_file(Path(small_town(tmp_path)))
     build_region(plan_build(spec, out=tmp_path / "out"))

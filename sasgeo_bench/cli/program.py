@@ -61,7 +61,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Runs": {
         "run": "runs",
         "merge": "runs",
-        "profile": "runs",
+        "profile": "profiling",
         "submit": "entering",
         "enter": "entering",
     },

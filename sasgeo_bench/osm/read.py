@@ -22,12 +22,12 @@ from sasgeo_bench.osm.coverage import FULL_SHARE, LONGEST_M, M_PER_DEG, choose_c
 from sasgeo_bench.osm.families import missing_families
 from sasgeo_bench.osm.features import DTYPES, SEA, check_features, make_features
 from sasgeo_bench.osm.geojson import classless, scan_geojson
-from sasgeo_bench.osm.locate import CoverageSource
+from sasgeo_bench.osm.locate import ClassTable, CoverageSource
 from sasgeo_bench.osm.mapped import Mapped, box_text, find_shore, lonlat_box, map_ground, project
 from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Scan, ScanRow, Traits, joined_wkb, scan_file
 from sasgeo_bench.osm.snapshot import Snapshot, elements, open_snapshot, own_id
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
-from sasgeo_bench.osm.vector import ClassTable, scan_vector
+from sasgeo_bench.osm.vector import scan_vector
 
 # Lines with the trait "through" lead somewhere: where they end at the edge of the data, the extract was cut there. Of
 # 191 extracts with a box, those cut along a border have 2 to 11 such ends beyond the estimated area, or more than 0.38

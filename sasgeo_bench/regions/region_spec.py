@@ -23,9 +23,8 @@ from sasgeo_bench.core.config import (
 from sasgeo_bench.core.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
-from sasgeo_bench.osm.locate import Extract, PlainName, Sha256
+from sasgeo_bench.osm.locate import ClassTable, Extract, PlainName, Sha256
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.osm.vector import ClassTable
 from sasgeo_bench.regions.imagery import ImageryEntry
 from sasgeo_bench.regions.region import LICENCE, Provenance
 

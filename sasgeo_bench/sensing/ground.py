@@ -8,13 +8,13 @@ from typing import Final, Self
 import numpy as np
 import pyproj
 import rasterio
+import scipy  # its parts are loaded where they are used: what only plans or carries pictures starts without them
 from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 from rasterio._err import CPLE_BaseError
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.vrt import WarpedVRT
-from scipy.ndimage import map_coordinates
 
 from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.core.geotiff import open_geotiff
@@ -103,7 +103,7 @@ class Dem:
         with np.errstate(invalid="ignore"):
             within: NDArray[np.bool_] = np.all((uv >= 0) & (uv <= (self.grid.cols, self.grid.rows)), axis=1)
         at = np.where(within[:, None], uv - 0.5, 0.0)  # the lattice of centres
-        found = map_coordinates(self.cells_m, at[:, ::-1].T, order=1, mode="nearest", output=np.float64)
+        found = scipy.ndimage.map_coordinates(self.cells_m, at[:, ::-1].T, order=1, mode="nearest", output=np.float64)
         return np.where(within, found, np.nan)
 
     def meet(self, origin_m: Points, directions: Points) -> Points:

@@ -92,12 +92,14 @@ def test_the_newest_extract_is_picked_and_any_by_its_date():
 
 def test_a_region_that_new_region_wrote_is_found_by_its_name_after_those_of_the_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=r"there is no region 'my-town' \(list regions shows all\)"):
+    with pytest.raises(ConfigError, match=r"there is no region 'my-town' \(list regions or new-region\)"):
         find_region_file("my-town")
     own = OWN_FOLDER / "my-town.toml"
     own.parent.mkdir()
     own.write_text(text().replace('"mine"', '"my-town"'), encoding="utf-8")
     assert find_region_file("my-town") == own
+    with pytest.raises(ConfigError, match="there is no region 'my-twn', did you mean 'my-town'"):
+        find_region_file("my-twn")
     other = tmp_path / "others" / "my-town.toml"
     other.parent.mkdir()
     other.write_text(own.read_text(encoding="utf-8"), encoding="utf-8")

@@ -36,6 +36,7 @@ from sasgeo_bench.flights.log_streams import (
     known_fields,
     library,
     quaternions_of_angles,
+    resets_of,
 )
 
 Floats = NDArray[np.float64]
@@ -192,7 +193,7 @@ def _of_text(
 FIELDS: Final = frozenset(
     {
         *("TimeUS", "TimeMS", "T", "I", "C", "Status", "GMS", "GWk", "Week", "Lat", "Lng", "Alt", "HAcc", "RelHomeAlt"),
-        *("Yaw", "Pitch", "Roll", "PN", "PE", "PD", "SS", "PI", "PX", "PY", "PZ", "R", "P", "Y"),
+        *("Yaw", "Pitch", "Roll", "PN", "PE", "PD", "SS", "PI", "PX", "PY", "PZ", "R", "P", "Y", "Rst"),
         *(f"{what}D{axis}" for what in ("Ang", "Pos") for axis in "XYZ"),
     }
 )
@@ -257,7 +258,8 @@ def estimates_of(messages: Messages) -> list[Estimate]:
     if (columns := messages.messages.get("VISP")) is not None:
         turns = quaternions_of_angles(columns["Y"], columns["P"], columns["R"])
         poses = np.column_stack([*(columns[key] for key in ("PX", "PY", "PZ")), turns])
-        return [Estimate(poses=Stream.of(source, "VISP", seconds(columns), poses))]
+        resets_s = resets_of(seconds(columns), columns["Rst"]) if "Rst" in columns else np.empty(0)
+        return [Estimate(poses=Stream.of(source, "VISP", seconds(columns), poses), resets_s=resets_s)]
     if (columns := messages.messages.get("VISO")) is not None:
         return [Estimate(poses=Stream.of(source, "VISO", seconds(columns), _summed(columns)))]
     for poses_of, flags_of in (("XKF1", "XKF4"), ("NKF1", "NKF4")):

@@ -20,8 +20,10 @@ from scipy.spatial.transform import Rotation
 from sasgeo_bench.core.errors import FlightError, counted
 from sasgeo_bench.flights import log_bags, log_dataflash, log_telemetry, log_ulog
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, pair_run
-from sasgeo_bench.flights.log_streams import NED_OF_ENU, LoggedOdometry, Stream, turned_at
+from sasgeo_bench.flights.log_streams import NED_OF_ENU, LoggedOdometry, Stream, turned_at, yaws_deg
+from sasgeo_bench.flights.odometry import LoggedSteps
 from sasgeo_bench.flights.trajectory import Trajectory
+from sasgeo_bench.geometry.pose import wrap_deg
 
 Floats = NDArray[np.float64]
 
@@ -105,6 +107,84 @@ def read_runs(
     if not has_yaw:
         notes.append("headings: the vehicle's own, so no drift of heading is measured")
     return LoggedRuns(runs=tuple(runs), has_yaw=has_yaw, accuracy_m=log.fixes.accuracy_m, notes=(*notes, *log.notes))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnOdometry:
+    """The odometry of a log, as that of the flight in it.
+
+    Parameters
+    ----------
+    log : LoggedOdometry
+        With attitudes of the vehicle.
+    clock_s : float
+        Seconds of the log's clock at time 0 of the flight.
+    """
+
+    log: LoggedOdometry
+    clock_s: float
+
+    @property
+    def name(self) -> str:
+        """Return the message or topic that the poses are of."""
+        return self.log.estimate.poses.name
+
+    def steps(self, time_s: Floats) -> LoggedSteps:
+        """Return what the log says of the steps between moments of the flight, shape (N,), in order.
+
+        Both ends of a step lie in one stretch without GNSS, between the first and the last pose of the estimate. It is
+        lost where poses are silent for more than two seconds on the way, none is within a second of an end, or the
+        estimate says that its frame jumped. Places at the moments are by lines between the poses, headings by the
+        shortest turn; both are the estimate's own, and so is the length of its metre. Only axes of places without
+        attitudes are the vehicle's.
+        """
+        estimate, attitudes = self.log.estimate, self.log.attitudes
+        assert attitudes is not None  # noqa: S101 - by `read_own`
+        at_s, poses = time_s + self.clock_s, estimate.poses
+        turns = _quaternions(poses) if estimate.has_attitudes else attitudes
+        yaw_deg = yaws_deg(turned_at(turns, at_s).as_quat())
+        place_m = poses.at(at_s)
+        moved = np.diff(place_m[:, 1] + 1j * place_m[:, 0]) * np.exp(1j * np.radians(yaw_deg[:-1]))
+        begin_s, end_s = at_s[:-1], at_s[1:]
+        spans_s = [(max(one, poses.time_s[0]), min(other, poses.time_s[-1])) for one, other in estimate.free_s]
+        is_logged = np.any(
+            [(begin_s >= one) & (end_s <= other) for one, other in spans_s] or [begin_s < -np.inf], axis=0
+        )
+        is_known = poses.knows(at_s) & turns.knows(at_s)
+        silent = np.flatnonzero(np.diff(poses.time_s) > LOST_S)
+        is_lost = ~(is_known[:-1] & is_known[1:])
+        for one, other in zip(poses.time_s[silent], poses.time_s[silent + 1], strict=True):
+            is_lost |= (begin_s < other) & (end_s > one)
+        for reset_s in estimate.resets_s:
+            is_lost |= (begin_s < reset_s) & (reset_s <= end_s)
+        return LoggedSteps(
+            right_m=moved.real,
+            up_m=moved.imag,
+            yaw_deg=wrap_deg(np.diff(yaw_deg)) if estimate.has_attitudes else np.full(len(moved), np.nan),
+            is_logged=is_logged,
+            is_lost=is_lost & is_logged,
+        )
+
+    def where(self, steps: LoggedSteps) -> str:
+        """Return in words how many steps are the log's, and what tells so."""
+        lost = f", lost in {steps.is_lost.sum()} of these" if steps.is_lost.any() else ""
+        return f"of the log ({self.name}) in {steps.is_logged.sum()} of {counted(len(steps.right_m), 'step')}{lost}"
+
+
+def read_own(path: Path, *, clock_s: float, vehicle: int | None = None, topic: str | None = None) -> OwnOdometry:
+    """Read the odometry of a log for its own flight, whose time 0 is `clock_s` on the log's clock.
+
+    Raises
+    ------
+    FlightError
+        If the log has none, or none that fused no receiver, or no attitudes; the message names what it has.
+    """
+    log = _read(path, vehicle, topic)
+    if log.attitudes is None:
+        raise log.source.fault("has no attitudes, so that nobody knows in which axes its odometry moves: log them")
+    if not log.estimate.free_s:
+        raise log.source.fault(_why_none(log))
+    return OwnOdometry(log=log, clock_s=clock_s)
 
 
 def _read(path: Path, vehicle: int | None, topic: str | None) -> LoggedOdometry:

@@ -112,6 +112,8 @@ class FlightLog:
         Seconds since `start_s`, strictly increasing.
     start_s : float, optional
         Seconds since 1970, UTC, at `time_s` 0; None where the file does not say its zone.
+    clock_s : float, optional
+        Seconds of the log's own clock at `time_s` 0, which its other messages count by; None where it has no other.
     height_m : ndarray, shape (N,), optional
         Height above the ground or the place of take-off, metres; never one above the sea.
     altitude_m : ndarray, shape (N,), optional
@@ -128,6 +130,7 @@ class FlightLog:
     lat_deg: Floats
     time_s: Floats | None = None
     start_s: float | None = None
+    clock_s: float | None = None
     height_m: Floats | None = None
     altitude_m: Floats | None = None
     altitude_of: AltitudeOf = "unknown"
@@ -187,6 +190,7 @@ class FlightLog:
             lat_deg=columns["lat_deg"],
             **{name: columns.get(name) for name in ("time_s", "height_m", "altitude_m", *_ANGLES)},
             start_s=start_s,
+            clock_s=None,
             altitude_of=altitude_of,
             notes=notes,
         )

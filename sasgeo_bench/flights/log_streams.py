@@ -212,11 +212,14 @@ class Estimate:
         From when to when no receiver was fused, seconds of the log's clock.
     fused : str
         What tells so, for messages: flags, or what kind of estimator it is.
+    resets_s : ndarray, shape (R,)
+        When the frame of the poses jumped, as the estimator itself counts it.
     """
 
     poses: Stream
     free_s: tuple[tuple[float, float], ...] = ((-np.inf, np.inf),)
     fused: str = "of a camera"
+    resets_s: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def has_attitudes(self) -> bool:
@@ -305,6 +308,16 @@ def free_stretches(flags: Sequence[tuple[Floats, Bools]]) -> tuple[tuple[float, 
         starts, ends = np.flatnonzero(steps < 0).tolist(), np.flatnonzero(steps > 0).tolist()
         found += [(float(part[at]), float(part[end - 1])) for at, end in zip(starts, ends, strict=True) if end - at > 1]
     return tuple(found)
+
+
+def resets_of(time_s: Floats, *counters: Floats) -> Floats:
+    """Return when any counter of resets, shape (N,) as the times, changed.
+
+    >>> resets_of(np.array([0.0, 0.1, 0.2]), np.array([3.0, 3.0, 4.0])).tolist()
+    [0.2]
+    """
+    changed = [np.append(False, np.diff(np.asarray(one, dtype=np.float64)) != 0) for one in counters]
+    return time_s[np.logical_or.reduce(changed)] if changed else np.empty(0)
 
 
 def quaternions_of_ned(w: Floats, x: Floats, y: Floats, z: Floats) -> Floats:
@@ -401,7 +414,7 @@ def flight_of(source: LogSource, streams: Streams) -> FlightLog:
     else:
         notes += streams.clock.notes()
         start_s = streams.clock.offset_s + float(time_s[0])
-    return FlightLog.of(
+    log = FlightLog.of(
         source,
         range(1, len(time_s) + 1),
         columns,
@@ -409,6 +422,7 @@ def flight_of(source: LogSource, streams: Streams) -> FlightLog:
         altitude_of=fixes.altitude_of,
         notes=(*notes, *streams.notes),
     )
+    return replace(log, clock_s=float(time_s[0]))
 
 
 def angles_at(attitudes: Stream, time_s: Floats) -> tuple[Floats, Floats, Floats]:

@@ -36,6 +36,7 @@ from sasgeo_bench.flights.log_streams import (
     library,
     quaternions_of_angles,
     quaternions_of_ned,
+    resets_of,
 )
 
 Floats = NDArray[np.float64]
@@ -77,8 +78,8 @@ FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     GPS_RAW: ("time_usec", "fix_type", "lat", "lon", "alt", "h_acc"),
     POSITION: ("time_boot_ms", "lat", "lon", "alt", "relative_alt"),
     ATTITUDE: ("time_boot_ms", "yaw", "pitch", "roll"),
-    ODOMETRY: ("time_usec", "estimator_type", "x", "y", "z", "q[0]", "q[1]", "q[2]", "q[3]"),
-    VISION: ("usec", "x", "y", "z", "roll", "pitch", "yaw"),
+    ODOMETRY: ("time_usec", "estimator_type", "x", "y", "z", "q[0]", "q[1]", "q[2]", "q[3]", "reset_counter"),
+    VISION: ("usec", "x", "y", "z", "roll", "pitch", "yaw", "reset_counter"),
 }
 _PLACES: Final = (GPS_RAW, POSITION)
 
@@ -300,7 +301,8 @@ def estimates_of(telemetry: Telemetry) -> list[Estimate]:
         own_s = columns["time_usec" if name == ODOMETRY else "usec"] / 1e6
         time_s = _on_boot(telemetry.messages, own_s, columns["received"], is_own=False)
         poses = np.column_stack([columns["x"], columns["y"], columns["z"], turns])
-        found.append(Estimate(poses=Stream.of(telemetry.source, called, time_s, poses)))
+        stream = Stream.of(telemetry.source, called, time_s, poses)
+        found.append(Estimate(poses=stream, resets_s=resets_of(time_s, columns["reset_counter"])))
     if not found:
         why = f"{', '.join(refused)} may have fused GNSS" if refused else f"neither {ODOMETRY} nor {VISION} was sent"
         raise telemetry.source.fault(

@@ -33,6 +33,7 @@ from sasgeo_bench.flights.log_streams import (
     known_fields,
     library,
     quaternions_of_ned,
+    resets_of,
 )
 
 Floats = NDArray[np.float64]
@@ -237,7 +238,8 @@ def estimates_of(topics: Topics) -> list[Estimate]:
         keys = ["x", "y", "z"] if is_old else [f"position[{at}]" for at in range(3)]
         turns = quaternions_of_ned(*(columns[f"q[{at}]"] for at in range(4)))
         poses = np.column_stack([*(columns[key] for key in keys), turns])
-        found.append(Estimate(poses=Stream.of(topics.source, name, seconds(columns), poses)))
+        stream = Stream.of(topics.source, name, seconds(columns), poses)
+        found.append(Estimate(poses=stream, resets_s=_resets(columns, ("reset_counter",))))
     local = topics.first(_LOCAL)
     if found or local is None:
         return found
@@ -246,7 +248,12 @@ def estimates_of(topics: Topics) -> list[Estimate]:
     is_valid = np.asarray(columns.get("xy_valid", np.ones(len(columns["timestamp"]))), dtype=bool)
     poses = np.column_stack([columns[key] for key in ("x", "y", "z")])
     stream = Stream.of(topics.source, name, seconds(columns)[is_valid], poses[is_valid])
-    return [Estimate(poses=stream, free_s=free_s, fused=fused)]
+    resets_s = _resets(columns, ("xy_reset_counter",))
+    return [Estimate(poses=stream, free_s=free_s, fused=fused, resets_s=resets_s)]
+
+
+def _resets(columns: Columns, names: tuple[str, ...]) -> Floats:
+    return resets_of(seconds(columns), *(columns[name] for name in names if name in columns))
 
 
 def read_odometry(path: Path) -> LoggedOdometry:

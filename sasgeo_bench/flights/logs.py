@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import pyproj
@@ -21,6 +21,7 @@ from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
 from sasgeo_bench.flights.log_dataflash import read_dataflash
+from sasgeo_bench.flights.log_odometry import OwnOdometry, read_own
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
 from sasgeo_bench.flights.log_subtitles import read_srt
 from sasgeo_bench.flights.log_table import read_csv
@@ -55,6 +56,8 @@ _TELEMETRY: Final = ".tlog"
 SUFFIXES: Final = (*_READERS, _TELEMETRY, *BAGS, *_TABLES, *_TUM)
 SHORTEST_FLOWN_M: Final = 200.0  # of a flight whose views are drawn: five or so
 _GROUND_CELL_M: Final = 10.0  # of heights of the ground
+OdometryOf = Literal["log", "drawn"]
+ODOMETRY_OF: Final = ("log", "drawn")
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
@@ -243,16 +246,26 @@ def _over(log: FlightLog | None, path: Path, region: Region, cut: _Cut) -> Traje
 
 @dataclass(frozen=True, kw_only=True)
 class FlownPath:
-    """The log of a flight that was flown, and what it does not say; `read_flight` says what each means."""
+    """The log of a flight that was flown, and what it does not say; `read_flight` says what each means.
+
+    `odometry` is that of the log where no receiver was fused into it, or `drawn` by a profile all the way; `topic` has
+    it in a bag whose messages do not say what they fused.
+    """
 
     file: Path
     facts: LogFacts = field(default_factory=LogFacts)
     height_m: float | None = None
     least_m: float = SHORTEST_FLOWN_M
+    odometry: OdometryOf = "log"
+    topic: str | None = None
 
     def __post_init__(self) -> None:
         if not self.file.is_file() and not is_bag(self.file):
             raise FlightError(f"there is no flight log {self.file}: check the path")
+        if self.odometry not in ODOMETRY_OF:
+            raise FlightError(f"--odometry is one of {', '.join(ODOMETRY_OF)}, got {self.odometry!r}")
+        if self.topic is not None and (self.odometry == "drawn" or not is_bag(self.file)):
+            raise FlightError(f"--topic is of the odometry of a bag, and {self.file.name} gives none: leave it out")
 
     @cached_property
     def key(self) -> str:
@@ -260,6 +273,7 @@ class FlownPath:
         logs = sorted(self.file.iterdir()) if self.file.is_dir() else [self.file]
         files = [*map(sha256_of, logs), None if self.facts.dem is None else sha256_of(self.facts.dem)]
         asked = [*files, self.file.name, asdict(self.facts) | {"dem": None}, self.height_m, self.least_m]
+        asked += [self.odometry, self.topic]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 
     @cached_property
@@ -271,6 +285,16 @@ class FlownPath:
     def start_s(self) -> float | None:
         """When the log begins, seconds since 1970, UTC; None where it does not tell."""
         return None if self.log is None else self.log.start_s
+
+    def own_odometry(self) -> OwnOdometry:
+        """Return the log's own odometry; raise `FlightError` that says why it has none that fused no GNSS."""
+        if self.odometry == "drawn":
+            raise FlightError("--odometry drawn says so")
+        if self.log is None:
+            raise FlightError(f"{self.file.name} has poses, and no odometry beside them")
+        if self.log.yaw_deg is None and self.log.clock_s is not None:
+            raise FlightError(f"{self.file.name} has no attitudes, so that its heading is that of its course")
+        return read_own(self.file, clock_s=self.log.clock_s or 0.0, vehicle=self.facts.vehicle, topic=self.topic)
 
     def over(self, region: Region, *, margin_m: float) -> Trajectory:
         """Return the longest stretch over a region, as `read_flight` does."""

@@ -14,7 +14,7 @@ from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, OwnRegi
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.progress import reported, spread, tell
-from sasgeo_bench.flights.logs import FlownPath
+from sasgeo_bench.flights.logs import FlownPath, OdometryOf
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
@@ -67,6 +67,12 @@ class QueryOptions(Options):
         typer.Option(help="log of a flight that was flown, for suites of flights; it is their one site"),
     ] = None
     height: Annotated[float | None, typer.Option(help="of that flight above the ground, instead of the log's")] = None
+    odometry: Annotated[
+        OdometryOf,
+        typer.Option(
+            help="of that flight: of its log where this fused no GNSS, or drawn by a profile of drift (drawn)"
+        ),
+    ] = "log"
     up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False
     skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False
@@ -130,10 +136,11 @@ def make_queries_command(options: QueryOptions) -> None:
 
 def _flown(options: QueryOptions) -> FlownPath | None:
     if options.flight is None:
-        if options.height is not None:
-            raise ConfigError("--height is of a flight: name its log by --flight")
+        for name, is_said in (("height", options.height is not None), ("odometry", options.odometry != "log")):
+            if is_said:
+                raise ConfigError(f"--{name} is of a flight: name its log by --flight")
         return None
-    return FlownPath(file=options.flight, height_m=options.height)
+    return FlownPath(file=options.flight, height_m=options.height, odometry=options.odometry)
 
 
 def _folder(request: Request) -> Path:

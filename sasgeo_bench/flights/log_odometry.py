@@ -129,6 +129,11 @@ class OwnOdometry:
         """Return the message or topic that the poses are of."""
         return self.log.estimate.poses.name
 
+    @property
+    def told(self) -> str:
+        """Return what tells when no receiver was fused."""
+        return self.log.estimate.fused
+
     def steps(self, time_s: Floats) -> LoggedSteps:
         """Return what the log says of the steps between moments of the flight, shape (N,), in order.
 

@@ -15,9 +15,11 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
-from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.errors import ConfigError, FlightError, SasgeoError, StoreError, counted
 from sasgeo_bench.core.folders import fresh_folder, locked
 from sasgeo_bench.core.progress import reporting, spread, tell
+from sasgeo_bench.flights.log_odometry import OwnOdometry
+from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import read_bits
@@ -26,7 +28,7 @@ from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.edited_maps import changed_maps, degraded_map, edit_maps, nothing_to_ask
-from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer
+from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer, odometry_in_words
 from sasgeo_bench.tasks.frames import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.pictured_ground import PicturedGround
@@ -180,9 +182,10 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
     suite = replace(suite, variants=suite.usable(scene))
     if isinstance(suite, FlightSuite):
         over = base if scene.pictured is None else base.within(scene.pictured.footprint)
-        flown = None
+        flown, own, why_drawn = None, None, ""
         if request.flown is not None:
             flown = request.flown.over(over, margin_m=suite.clear_m(scene))
+            own, why_drawn = _own_odometry(request.flown)
             seeds = seeds.under("flown", request.flown.key)  # another log has other ids: no answer fits both
         airspace = Airspace(
             region=over,
@@ -193,15 +196,32 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
             group=group,
             flown=flown,
             start_s=None if request.flown is None else request.flown.start_s,
+            own=own,
         )
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
         airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))
-        pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice)
+        odometry = None
+        if flown is not None:
+            odometry = odometry_in_words(flights[0], own, why_drawn)
+            tell(f"odometry: {odometry}")
+            if flights[0].has_own:
+                airspace = replace(airspace, suite=replace(suite, variants=suite.variants + suite.of_log))
+        pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice, odometry=odometry)
         return pilot, [flight.site for flight in flights.values()]
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split, choice=request.choice)
     drawer, edited = edit_maps(request, drawer, base, sites)
     return drawer, list(edited)
+
+
+def _own_odometry(flown: FlownPath) -> tuple[OwnOdometry | None, str]:
+    """Return the odometry of a log, or why it has none; raise if it was asked for by name."""
+    try:
+        return flown.own_odometry(), ""
+    except FlightError as error:
+        if flown.topic is not None:
+            raise
+        return None, str(error)
 
 
 def _view_reach_m(request: Request, suite: Suite) -> float:
@@ -381,6 +401,7 @@ def _origin(
     pictured = filter(None, (drawer.scene.pictured, drawer.scene.pictured_elsewhere))
     owners = "; ".join(dict.fromkeys(item.imagery.record.attribution for item in pictured))
     texts |= {"picture_attribution": owners} if owners else {}
+    texts |= {"odometry": drawer.odometry} if isinstance(drawer, FlightDrawer) and drawer.odometry else {}
     return TaskOrigin(
         suite=card.name,
         suite_version=card.version,

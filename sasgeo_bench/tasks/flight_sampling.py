@@ -11,9 +11,11 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError, FlightError
+from sasgeo_bench.core.progress import tell
 from sasgeo_bench.flights.drift_profile import load_profile
 from sasgeo_bench.flights.kinematics import fly
-from sasgeo_bench.flights.odometry import Odometry, draw_odometry
+from sasgeo_bench.flights.log_odometry import OwnOdometry
+from sasgeo_bench.flights.odometry import LoggedSteps, Odometry, draw_odometry
 from sasgeo_bench.flights.plans import KINDS, PlanKind, flight_area, plan_flight
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Pose, Prior, rotation
@@ -60,18 +62,23 @@ from sasgeo_bench.tasks.suites.flights import (
 Floats = NDArray[np.float64]
 
 UTC: Final = "utc_s"  # measured: when a view of a logged flight was flown, seconds since 1970; the log may not tell it
+LOGGED: Final = "is_logged"  # measured: whether the step to a view is of the log's own odometry
 _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flight:
-    """A flight over a region: N views, their mean spacing, the scale that all have, and how maps are changed for it."""
+    """A flight over a region: N views, their mean spacing, the scale that all have, and how maps are changed for it.
+
+    `own` are the steps of its log's odometry between the views.
+    """
 
     site: Site
     views: Trajectory
     spacing_m: float
     scale: float
     plot: Plot | None = None
+    own: LoggedSteps | None = None
 
     @property
     def length_m(self) -> float:
@@ -82,6 +89,29 @@ class Flight:
     def middle(self) -> int:
         """Return the index of the view in the middle."""
         return len(self.views) // 2
+
+    @property
+    def has_own(self) -> bool:
+        """Return whether the log's odometry has any step between the views."""
+        return self.own is not None and bool(self.own.is_logged.any())
+
+
+def odometry_in_words(flight: Flight, own: OwnOdometry | None, why_drawn: str) -> str:
+    """Return where the odometry of a flight that was flown is from, and tell how far that of its log is off."""
+    profile, steps = f"the profile {Mission().profile}", flight.own
+    if own is None or steps is None:
+        return f"drawn by profiles of drift: {why_drawn}"
+    if not flight.has_own:
+        return f"drawn by profiles of drift: {own.name} fused GNSS or has no poses along the flight ({own.told})"
+    off_pct, off_deg = steps.off(flight.views)
+    turned = "" if math.isnan(off_deg) else f" and its turns by {off_deg:.2g} deg"
+    tell(f"steps of {own.name} are off the receiver by {off_pct:.2g} % of the way{turned} (medians)")
+    words = own.where(steps)
+    if not steps.is_logged.all():
+        words += f", drawn by {profile} where it fused GNSS or has no poses ({own.told})"
+    if math.isnan(off_deg):
+        words += "; turns are drawn, as its headings are the vehicle's and so are those of the truth"
+    return f"{words}; noise is declared as {profile} has it"
 
 
 def pose_of(views: Trajectory, frame: int, scale: float) -> Pose:
@@ -95,7 +125,7 @@ class Airspace:
     """Where the flights of a suite may go, and the seeds of region and suite that they are drawn from.
 
     `flown` is a flight that was flown there; it is the only one then. `start_s` is when its clock was 0, seconds since
-    1970, UTC, if that is known.
+    1970, UTC, if that is known; `own` the odometry of its log, if it has some.
     """
 
     region: Region
@@ -106,6 +136,7 @@ class Airspace:
     group: PriorGroup
     flown: Trajectory | None = None
     start_s: float | None = None
+    own: OwnOdometry | None = None
 
     def seeds_of(self, index: int) -> Seeds:
         """Return the seeds of one flight."""
@@ -188,7 +219,8 @@ class Airspace:
                 f"the flight over {where} sees too little that is mapped: {self.suite.card.min_density:.0%} are needed"
             )
         site = Site(index=0, pose=pose_of(views, 0, scale), block=self._block(views), density=0.0)
-        return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot)
+        own = None if self.own is None else self.own.steps(views.time_s)
+        return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot, own=own)
 
     def _plot(self, views: Trajectory, before: Sequence[Flight], rng: np.random.Generator) -> Plot | None:
         """Return how maps are changed for a flight after those before it; None if they are not, or have no room."""
@@ -284,11 +316,15 @@ _MOST_GAP: Final = 1 / 3  # of a flight
 
 @dataclass(frozen=True, kw_only=True)
 class FlightDrawer:
-    """Draw the flights of one suite on one region; `carried` caches where carried drones come from."""
+    """Draw the flights of one suite on one region; `carried` caches where carried drones come from.
+
+    `odometry` says where that of a flight that was flown is from.
+    """
 
     airspace: Airspace
     flights: dict[int, Flight]
     choice: Choice = EVERYTHING
+    odometry: str | None = None
     carried: dict[tuple[int, float], Trajectory | None] = field(default_factory=dict)
 
     @property
@@ -383,6 +419,8 @@ class FlightDrawer:
             step = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
             flown = {"distance_m": round(float(distance_m[frame]), 1), "time_s": round(float(time_s[frame]), 2)}
             own = flown | {"is_seen": float(not unseen[frame])}
+            if flight.own is not None and mission.takes_log and frame > 0:
+                own[LOGGED] = float(flight.own.is_logged[frame - 1] and (before is None or frame > flight.middle))
             if self.airspace.start_s is not None:
                 own[UTC] = round(self.airspace.start_s + float(views.time_s[frame]), 3)
             yield self._view(job, mission, pose_of(views, frame, flight.scale), step, own | measured)
@@ -394,6 +432,9 @@ class FlightDrawer:
             draw_odometry(flown, profile, belief=mission.belief, rng=seeds.rng("odometry", mission.draw))
             for flown in (views, flight.views)
         )
+        if flight.own is not None and mission.takes_log:
+            control = flight.own.over(control, profile, belief=mission.belief)
+            step = control if views is flight.views else step
         both = {item.name: (getattr(step, item.name), getattr(control, item.name)) for item in fields(Odometry)}
         return Odometry(**{name: np.concatenate([own[:into], usual[into:]]) for name, (own, usual) in both.items()})
 

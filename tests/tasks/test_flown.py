@@ -1,17 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Queries along a flight that was flown: its log is the path, and what cannot be asked is refused in one line."""
 
+import itertools
+import re
+from dataclasses import replace
+
 import numpy as np
 import pyproj
 import pytest
 import shapely
 
 from sasgeo_bench.core.errors import ConfigError, FlightError
+from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks, make_tasks
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
+from tests.flights import autopilots
 from tests.tasks.test_task_plan import own_region
 
 TOWN = "town-grid"
@@ -130,3 +136,141 @@ def test_a_place_that_no_split_speaks_of_is_all_test(tmp_path):
         plan_requests(
             TaskRequest(suites=("clean",), regions=(str(own),), split="crossfit", count=1, seed=0, out=tmp_path / "out")
         )
+
+
+# Odometry of the log
+
+
+class Logged:
+    """A ULog of a way over the town, five fixes a second at 10 m/s, with the poses of an odometer that is too long."""
+
+    scale = 1.04
+
+    def __init__(self, root):
+        manifest = read_manifest(root / "regions" / TOWN)
+        way = shapely.LineString(corners(root))
+        self.time_s = np.arange(0, way.length / 10, 0.2)
+        self.en_m = shapely.get_coordinates(shapely.line_interpolate_point(way, 10 * self.time_s))
+        lon, lat = pyproj.Transformer.from_crs(manifest.epsg, 4326, always_xy=True).transform(*self.en_m.T)
+        self.lonlat = np.column_stack([lon, lat])
+        east, north = np.gradient(self.en_m, axis=0).T
+        self.yaw_deg = np.degrees(np.unwrap(np.arctan2(east, north)))
+
+    def write(self, path, *, fused=bool, has_camera=False):
+        """Write it; GNSS is fused at times, and a camera's poses head 0.05 degrees a second too far to the right."""
+        us = autopilots.stamps_us(self.time_s)
+        own_m = self.scale * (self.en_m - self.en_m[0])
+        topics = {
+            ("vehicle_gps_position", 0): (
+                autopilots.GPS_114,
+                [(one, 0, lat, lon, 100.0, 147.0, 1.0, 3) for one, (lon, lat) in zip(us, self.lonlat, strict=True)],
+            ),
+            ("vehicle_attitude", 0): (
+                autopilots.ATTITUDE,
+                [(one, *autopilots.turn(yaw)) for one, yaw in zip(us, self.yaw_deg, strict=True)],
+            ),
+            ("vehicle_local_position", 0): (
+                autopilots.LOCAL,
+                [(one, north, east, -90.0, True, True) for one, (east, north) in zip(us, own_m, strict=True)],
+            ),
+            ("estimator_status", 0): (
+                autopilots.STATUS,
+                [(one, 4 * fused(time_s + 1.0)) for one, time_s in zip(us, self.time_s, strict=True)],
+            ),
+        }
+        if has_camera:
+            yaw_deg = self.yaw_deg + 0.05 * self.time_s
+            topics["vehicle_visual_odometry", 0] = (
+                "uint64_t timestamp;uint8_t pose_frame;float[3] position;float[4] q;",
+                [
+                    (one, 2, north, east, -90.0, *autopilots.turn(yaw))
+                    for one, (east, north), yaw in zip(us, own_m, yaw_deg, strict=True)
+                ],
+            )
+        path.write_bytes(autopilots.ulog(topics))
+        return FlownPath(file=path, height_m=90.0)
+
+    def heard(self, task, kind):
+        """Yield for each view of a variant but the first its step, where it was and where before, and its truth."""
+        truths = {truth.query_id: truth for truth in task.truths if truth.kind == kind}
+        views = sorted((one for one in task.queries() if one.query_id in truths), key=lambda one: one.step.frame)
+        for before, view in itertools.pairwise(views):
+            yield view.step, truths[before.query_id].pose, truths[view.query_id].pose, truths[view.query_id]
+
+
+def moved(before, pose):
+    """Right and up of a step, and its turn, by plain numpy."""
+    east, north, a = pose.easting_m - before.easting_m, pose.northing_m - before.northing_m, np.radians(before.yaw_deg)
+    turn_deg = (pose.yaw_deg - before.yaw_deg + 180) % 360 - 180
+    return east * np.cos(a) - north * np.sin(a), east * np.sin(a) + north * np.cos(a), turn_deg
+
+
+def test_steps_of_the_logs_own_odometer_are_asked_in_place_of_drawn_ones(root, tmp_path, capsys) -> None:
+    logged = Logged(root)
+    with reporting(print):
+        (task,) = make_tasks(request_of(root, flown=logged.write(tmp_path / "a.ulg", has_camera=True)))
+    steps = list(logged.heard(task, "F1 of the log"))
+    count = len(steps)
+    assert count > 10
+    straight = 0
+    for step, before, pose, truth in steps:
+        right, up, turn_deg = moved(before, pose)
+        assert truth.measured["is_logged"] == 1.0
+        if abs(turn_deg) < 1:  # corners are cut
+            straight += 1
+            assert np.hypot(*step.increment[:2]) == pytest.approx(1.04 * np.hypot(right, up), abs=0.3)
+            assert 0 < step.increment[2] - turn_deg < 1  # by 0.05 degrees a second, of some 5 s
+            assert step.covariance[4] < (0.05 * up) ** 2  # by the profile: 1.2 % of scale, and slip
+    assert straight > count / 2
+    for step, before, pose, truth in logged.heard(task, "no drift"):
+        assert step.increment == pytest.approx(moved(before, pose), abs=1e-6)  # the control's odometer is perfect still
+        assert "is_logged" not in truth.measured
+    told = f"of the log (vehicle_visual_odometry 0) in {count} of {count} steps; noise is declared as the profile"
+    assert task.manifest.odometry.startswith(told)
+    out = capsys.readouterr().out
+    assert f"odometry: {told}" in out
+    # 4 % of its scale, and its axes head ever more wrong; 0.05 degrees a second are 0.25 a step
+    times_s = np.array([truth.measured["time_s"] for *_, truth in steps])
+    expected = np.median(np.abs(1.04 * np.exp(1j * np.radians(0.05 * times_s)) - 1))
+    found = re.search(
+        r"vehicle_visual_odometry 0 are off the receiver by ([\d.]+) % of the way and its turns by ([\d.]+)", out
+    )
+    off_pct, off_deg = map(float, found.groups())
+    assert off_pct == pytest.approx(100 * expected, abs=1.0)
+    assert off_deg == pytest.approx(0.25, abs=0.05)
+
+
+def test_steps_in_which_a_receiver_was_fused_are_drawn_and_counted(root, tmp_path) -> None:
+    logged = Logged(root)
+    end_s = float(logged.time_s[-1])
+    flown = logged.write(tmp_path / "a.ulg", fused=lambda time_s: time_s > end_s / 2)
+    (task,) = make_tasks(request_of(root, "flight-gap", flown=flown))
+    steps = list(logged.heard(task, "no gap"))
+    is_own = [truth.measured["is_logged"] == 1.0 for *_, truth in steps]
+    assert is_own == sorted(is_own, reverse=True)
+    assert 0.3 < np.mean(is_own) < 0.7
+    for one, (step, before, pose, _) in zip(is_own, steps, strict=True):
+        right, up, turn_deg = moved(before, pose)
+        if abs(turn_deg) < 1:
+            assert (np.hypot(*step.increment[:2]) == pytest.approx(1.04 * np.hypot(right, up), abs=0.3)) == one
+    assert task.manifest.odometry == (
+        f"of the log (vehicle_local_position 0) in {sum(is_own)} of {len(steps)} steps, drawn by the profile "
+        "vo-mono-survey where it fused GNSS or has no poses (estimator_status); turns are drawn, as its headings are "
+        "the vehicle's and so are those of the truth; noise is declared as the profile vo-mono-survey has it"
+    )
+
+
+@pytest.mark.parametrize(
+    ("odometry", "why"),
+    [
+        ("log", "a.ulg: vehicle_local_position 0 fused GNSS from start to end (estimator_status): it is a copy of"),
+        ("drawn", "--odometry drawn says so"),
+    ],
+)
+def test_an_estimate_that_fused_gnss_is_named_and_the_profile_taken(root, tmp_path, odometry, why) -> None:
+    logged = Logged(root)
+    flown = replace(logged.write(tmp_path / "a.ulg", has_camera=odometry == "drawn"), odometry=odometry)
+    (task,) = make_tasks(request_of(root, flown=flown))
+    assert task.manifest.odometry.startswith(f"drawn by profiles of drift: {why}")
+    assert not any("is_logged" in truth.measured for truth in task.truths)
+    assert "F1 of the log" not in {truth.kind for truth in task.truths}

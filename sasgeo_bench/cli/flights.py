@@ -59,9 +59,10 @@ class FlightOptions(Options):
         str | None, typer.Option(help="region that was flown over: id, or own file; its queries are drawn")
     ] = None
     suite: Annotated[str, typer.Option(help="suite of flights whose views are drawn along it")] = "flight-clean"
-    prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
-        None
-    )
+    prior: Annotated[
+        str | None,
+        typer.Option(help="prior group, as in r500-weak-s3, of flights also gnss; default: that of the suite"),
+    ] = None
     seed: Annotated[int, typer.Option(min=0, help="public random seed")] = 0
     extracts: ExtractFolders = None
     region_files: OwnRegionFolders = None

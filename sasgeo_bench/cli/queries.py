@@ -46,9 +46,10 @@ class QueryOptions(Options):
     n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8
     seed: Annotated[int | None, typer.Option(min=0, help="public random seed; default: 0")] = None
     seed_file: SeedFile = None
-    prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
-        None
-    )
+    prior: Annotated[
+        str | None,
+        typer.Option(help="prior group, as in r500-weak-s3, of flights also gnss; default: that of the suite"),
+    ] = None
     detector: Annotated[
         list[str] | None,
         typer.Option(

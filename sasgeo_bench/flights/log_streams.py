@@ -117,15 +117,21 @@ class Fixes:
         Messages without a fix.
     is_estimate : bool
         Whether an estimator gave them.
-    accuracy_m : float
-        Median of the horizontal accuracy that the receiver states, metres; NaN where it states none.
+    stated : Stream, optional
+        Horizontal accuracy that the receiver states, metres, shape (M, 1), at times of its own; None of one that states
+        none.
     """
 
     track: Stream
     altitude_of: AltitudeOf = "geoid"
     left_out: int = 0
     is_estimate: bool = False
-    accuracy_m: float = np.nan
+    stated: Stream | None = None
+
+    @property
+    def accuracy_m(self) -> float:
+        """Return the median of the horizontal accuracy that the receiver states, metres; NaN where it states none."""
+        return np.nan if self.stated is None else float(np.median(self.stated.values))
 
     @classmethod
     def of(
@@ -146,6 +152,12 @@ class Fixes:
         is_place &= (np.abs(table[:, 0]) <= 180) & (np.abs(table[:, 1]) <= 90) & np.isfinite(time_s) & is_fix
         track = Stream.of(source, name, np.asarray(time_s, dtype=np.float64)[is_place], table[is_place])
         return cls(track=track, left_out=int((~is_place).sum()), **others)  # type: ignore[arg-type]
+
+
+def stated_of(source: LogSource, name: str, time_s: Floats, accuracy_m: Floats) -> Stream | None:
+    """Return what a receiver states of its fixes, shape (N,), as a stream; None if it states nothing."""
+    is_stated = np.isfinite(accuracy_m) & (accuracy_m > 0)
+    return Stream.of(source, name, time_s[is_stated], accuracy_m[is_stated][:, None]) if is_stated.any() else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

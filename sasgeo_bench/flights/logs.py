@@ -19,6 +19,7 @@ from sasgeo_bench.core.errors import CameraError, FlightError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
+from sasgeo_bench.flights.gnss import SecondReceiver, second_receiver
 from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
 from sasgeo_bench.flights.log_dataflash import read_dataflash
 from sasgeo_bench.flights.log_odometry import OwnOdometry, read_own
@@ -295,6 +296,12 @@ class FlownPath:
         if self.log.yaw_deg is None and self.log.clock_s is not None:
             raise FlightError(f"{self.file.name} has no attitudes, so that its heading is that of its course")
         return read_own(self.file, clock_s=self.log.clock_s or 0.0, vehicle=self.facts.vehicle, topic=self.topic)
+
+    def second_receiver(self) -> SecondReceiver:
+        """Return a weaker receiver of the log beside that of the truth; raise `FlightError` that says why none is."""
+        if self.log is None or self.log.clock_s is None:
+            raise FlightError(f"{self.file.name} has no second receiver")
+        return second_receiver(self.file, clock_s=self.log.clock_s, vehicle=self.facts.vehicle)
 
     def over(self, region: Region, *, margin_m: float) -> Trajectory:
         """Return the longest stretch over a region, as `read_flight` does."""

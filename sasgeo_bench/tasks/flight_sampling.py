@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.core.errors import ConfigError, FlightError
+from sasgeo_bench.core.errors import ConfigError, FlightError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.flights.drift_profile import load_profile
+from sasgeo_bench.flights.gnss import CORRELATION_S, SIGMAS, SecondReceiver, WeakGnss, draw_gnss
 from sasgeo_bench.flights.kinematics import fly
 from sasgeo_bench.flights.log_odometry import OwnOdometry
 from sasgeo_bench.flights.odometry import LoggedSteps, Odometry, draw_odometry
@@ -60,9 +61,11 @@ from sasgeo_bench.tasks.suites.flights import (
 )
 
 Floats = NDArray[np.float64]
+Disc = tuple[tuple[float, float] | None, float | None]  # middle and radius of a prior's, None where it has none
 
 UTC: Final = "utc_s"  # measured: when a view of a logged flight was flown, seconds since 1970; the log may not tell it
 LOGGED: Final = "is_logged"  # measured: whether the step to a view is of the log's own odometry
+GNSS_OFF: Final = "gnss_off_m"  # measured: how far a view is from the fix of its prior
 _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 
 
@@ -70,7 +73,7 @@ _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 class Flight:
     """A flight over a region: N views, their mean spacing, the scale that all have, and how maps are changed for it.
 
-    `own` are the steps of its log's odometry between the views.
+    `own` are the steps of its log's odometry between the views, `gnss` the fixes of its log's weaker receiver.
     """
 
     site: Site
@@ -79,6 +82,7 @@ class Flight:
     scale: float
     plot: Plot | None = None
     own: LoggedSteps | None = None
+    gnss: WeakGnss | None = None
 
     @property
     def length_m(self) -> float:
@@ -114,6 +118,24 @@ def odometry_in_words(flight: Flight, own: OwnOdometry | None, why_drawn: str) -
     return f"{words}; noise is declared as {profile} has it"
 
 
+def gnss_in_words(flight: Flight, group: PriorGroup, receiver: SecondReceiver | None, why_drawn: str) -> str:
+    """Return where the fixes of priors by a weak receiver are from, and tell how far those of a log are off."""
+    gnss = flight.gnss
+    if gnss is None or receiver is None or not np.isfinite(gnss.radius_m).any():
+        disc_m = group.radius_m or math.nan
+        drawn = f"drawn, {disc_m / SIGMAS:.3g} m on each axis, correlated over {CORRELATION_S:g} s"
+        return f"{drawn}, in discs of {disc_m:g} m: {why_drawn or 'the log has no fix along the flight'}"
+    is_fix = np.isfinite(gnss.radius_m)
+    away_m, radius_m = gnss.away_m[is_fix], gnss.radius_m[is_fix]
+    tell(
+        f"fixes of {receiver.name} are off the truth by {np.median(away_m):.1f} m (median), in "
+        f"{(away_m > radius_m).sum()} of {counted(len(radius_m), 'view')} by more than their disc"
+    )
+    lacks = f", none in {(~is_fix).sum()} of {counted(len(is_fix), 'view')}" if not is_fix.all() else ""
+    stated = f"discs of {SIGMAS:g} times the accuracy that it states, {np.median(radius_m):.3g} m (median)"
+    return f"of {receiver.name} of the log, {stated}{lacks}"
+
+
 def pose_of(views: Trajectory, frame: int, scale: float) -> Pose:
     """Return the pose of one view."""
     east_m, north_m = views.position_m[frame, :2].tolist()
@@ -125,7 +147,8 @@ class Airspace:
     """Where the flights of a suite may go, and the seeds of region and suite that they are drawn from.
 
     `flown` is a flight that was flown there; it is the only one then. `start_s` is when its clock was 0, seconds since
-    1970, UTC, if that is known; `own` the odometry of its log, if it has some.
+    1970, UTC, if that is known; `own` the odometry of its log, `receiver` a weaker one beside that of the truth, if it
+    has them.
     """
 
     region: Region
@@ -137,6 +160,7 @@ class Airspace:
     flown: Trajectory | None = None
     start_s: float | None = None
     own: OwnOdometry | None = None
+    receiver: SecondReceiver | None = None
 
     def seeds_of(self, index: int) -> Seeds:
         """Return the seeds of one flight."""
@@ -220,7 +244,10 @@ class Airspace:
             )
         site = Site(index=0, pose=pose_of(views, 0, scale), block=self._block(views), density=0.0)
         own = None if self.own is None else self.own.steps(views.time_s)
-        return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot, own=own)
+        gnss = None
+        if self.receiver is not None:
+            gnss = self.receiver.along(views.time_s, views.position_m[:, :2], epsg=self.scene.map.grid.epsg)
+        return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot, own=own, gnss=gnss)
 
     def _plot(self, views: Trajectory, before: Sequence[Flight], rng: np.random.Generator) -> Plot | None:
         """Return how maps are changed for a flight after those before it; None if they are not, or have no room."""
@@ -318,13 +345,14 @@ _MOST_GAP: Final = 1 / 3  # of a flight
 class FlightDrawer:
     """Draw the flights of one suite on one region; `carried` caches where carried drones come from.
 
-    `odometry` says where that of a flight that was flown is from.
+    `odometry` and `gnss` say where that of a flight that was flown is from, and the fixes of priors by a weak receiver.
     """
 
     airspace: Airspace
     flights: dict[int, Flight]
     choice: Choice = EVERYTHING
     odometry: str | None = None
+    gnss: str | None = None
     carried: dict[tuple[int, float], Trajectory | None] = field(default_factory=dict)
 
     @property
@@ -414,6 +442,7 @@ class FlightDrawer:
             measured["carried_m"] = round(carried_m, 1)
             distance_m = np.where(np.arange(len(views)) < flight.middle, distance_m, distance_m - carried_m)
         unseen, time_s = _unseen(flight, mission), views.time_s - views.time_s[0]
+        gnss = self._gnss(flight, mission, before)
         for frame in range(len(views)):
             is_lost = mission.is_lost and frame == flight.middle
             step = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
@@ -423,7 +452,12 @@ class FlightDrawer:
                 own[LOGGED] = float(flight.own.is_logged[frame - 1] and (before is None or frame > flight.middle))
             if self.airspace.start_s is not None:
                 own[UTC] = round(self.airspace.start_s + float(views.time_s[frame]), 3)
-            yield self._view(job, mission, pose_of(views, frame, flight.scale), step, own | measured)
+            fix = None
+            if gnss is not None:
+                place_m = views.position_m[frame, :2].tolist()
+                fix = gnss.disc(frame, (place_m[0], place_m[1]))
+                own |= {GNSS_OFF: round(float(gnss.away_m[frame]), 1)} if fix[0] is not None else {}
+            yield self._view(job, pose_of(views, frame, flight.scale), step, measured=own | measured, fix=fix)
 
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:
         """Return what the odometer says: to the middle and from there on what it says in the control."""
@@ -438,6 +472,22 @@ class FlightDrawer:
         both = {item.name: (getattr(step, item.name), getattr(control, item.name)) for item in fields(Odometry)}
         return Odometry(**{name: np.concatenate([own[:into], usual[into:]]) for name, (own, usual) in both.items()})
 
+    def _gnss(self, flight: Flight, mission: Mission, before: Trajectory | None) -> WeakGnss | None:
+        """Return the fixes of priors at the views of a flight, after another first half if it has one."""
+        group = mission.group or self.airspace.group
+        if not group.is_gnss or group.radius_m is None:
+            return None
+        seeds, radius_m = self._seeds(flight.site), group.radius_m
+        drawn = draw_gnss(flight.views.time_s, radius_m=radius_m, rng=seeds.rng("gnss", group.name))
+        here = flight.gnss or drawn
+        if before is None:
+            return here
+        there = draw_gnss(before.time_s, radius_m=radius_m, rng=seeds.rng("gnss", group.name, "carried"))
+        return WeakGnss(
+            off_m=np.concatenate([there.off_m, here.off_m[flight.middle :]]),
+            radius_m=np.concatenate([there.radius_m, here.radius_m[flight.middle :]]),
+        )
+
     def _seeds(self, site: Site) -> Seeds:
         return self.airspace.seeds_of(site.index)
 
@@ -448,9 +498,10 @@ class FlightDrawer:
         return self.carried[key]
 
     def _view(
-        self, job: Job, mission: Mission, pose: Pose, step: Step, measured: dict[str, float]
+        self, job: Job, pose: Pose, step: Step, *, measured: dict[str, float], fix: Disc | None
     ) -> tuple[Query, Truth]:
-        scene, variant, group = self.scene, job.variant, mission.group or self.airspace.group
+        scene, variant, mission = self.scene, job.variant, self.suite.mission(job.variant)
+        group = mission.group or self.airspace.group
         seeds = self._seeds(job.site)
         of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
         site = replace(job.site, pose=pose, density=drawn_share(scene.map, pose, variant))
@@ -466,6 +517,8 @@ class FlightDrawer:
         if step.frame == 0:
             rivals_m = () if copy is None else ((copy.easting_m, copy.northing_m),)
             prior = make_prior(pose, group, rng=seeds.rng("prior", group.name), rivals_m=rivals_m)
+        if fix is not None:
+            prior = replace(prior, center_m=fix[0], radius_m=fix[1])
         query = Query(
             query_id=view_id(step.sequence_id, step.frame),
             track="sequence",

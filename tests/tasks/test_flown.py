@@ -15,6 +15,7 @@ from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks, make_tasks
+from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.flights import autopilots
@@ -161,7 +162,7 @@ class Logged:
         east, north = np.gradient(self.true_m, axis=0).T
         self.yaw_deg = np.degrees(np.unwrap(np.arctan2(east, north)))
 
-    def write(self, path, *, fused=bool, has_camera=False):
+    def write(self, path, *, fused=bool, has_camera=False, second_m=None):
         """Write it; GNSS is fused at times, and a camera's poses head 0.05 degrees a second too far to the right."""
         us = autopilots.stamps_us(self.time_s)
         own_m = self.scale * self.true_m
@@ -183,6 +184,17 @@ class Logged:
                 [(one, 4 * fused(time_s + 1.0)) for one, time_s in zip(us, self.time_s, strict=True)],
             ),
         }
+        if second_m is not None:  # a receiver to the east, which states 5 m, and has no fix in the middle of the flight
+            wrong = self.lonlat + np.array([second_m / 111_320 / np.cos(np.radians(self.lonlat[0, 1])), 0])
+            half_s = self.time_s[-1] / 2
+            topics["sensor_gps", 0] = (
+                autopilots.GPS_114,
+                [
+                    (one, 0, lat, lon, 100.0, 147.0, 5.0, 3)
+                    for one, (lon, lat), time_s in zip(us, wrong, self.time_s, strict=True)
+                    if abs(time_s - half_s) > 15
+                ],
+            )
         if has_camera:
             yaw_deg = self.yaw_deg + 0.05 * self.time_s
             topics["vehicle_visual_odometry", 0] = (
@@ -279,3 +291,71 @@ def test_an_estimate_that_fused_gnss_is_named_and_the_profile_taken(root, tmp_pa
     assert task.manifest.odometry.startswith(f"drawn by profiles of drift: {why}")
     assert not any("is_logged" in truth.measured for truth in task.truths)
     assert "F1 of the log" not in {truth.kind for truth in task.truths}
+
+
+# Priors of a weak receiver
+
+
+def discs_of(task):
+    """Yield each view's truth, prior and place in its flight."""
+    truths = {truth.query_id: truth for truth in task.truths}
+    for query in task.queries():
+        yield truths[query.query_id], query.prior, query.step.frame
+
+
+def test_the_priors_of_a_flight_are_the_fixes_of_the_logs_second_receiver(root, tmp_path, capsys) -> None:
+    logged = Logged(root)
+    flown = logged.write(tmp_path / "a.ulg", second_m=9.0)
+    with reporting(print):
+        (task,) = make_tasks(request_of(root, "flight-gap", flown=flown, group=PriorGroup.parse("gnss")))
+    found = list(discs_of(task))
+    seen = [(truth, prior) for truth, prior, _ in found if prior.center_m is not None]
+    assert 0 < len(found) - len(seen) < len(found) / 3  # those of the middle have no fix
+    for truth, prior in seen:
+        east, north = np.subtract(prior.center_m, (truth.pose.easting_m, truth.pose.northing_m))
+        assert np.hypot(east, north) == pytest.approx(9.0, abs=0.3)
+        assert east > 8.5
+        assert prior.radius_m == 15.0
+        assert truth.measured["gnss_off_m"] == pytest.approx(9.0, abs=0.3)
+    assert {prior.yaw_sigma_deg for _, prior, frame in found if frame == 0} == {20.0}
+    assert {prior.yaw_sigma_deg for _, prior, frame in found if frame > 0} == {None}
+    assert {query.prior_group for query in task.queries()} == {"gnss-weak-s3"}
+    told = "of sensor_gps 0 of the log, discs of 3 times the accuracy that it states, 15 m (median), none in "
+    assert task.manifest.gnss.startswith(told)
+    out = capsys.readouterr().out
+    assert f"prior: fixes {told}" in out
+    assert "fixes of sensor_gps 0 are off the truth by 9.0 m (median), in 0 of" in out
+
+
+def test_without_a_second_receiver_a_weak_one_is_drawn_and_the_first_named(root, tmp_path) -> None:
+    logged = Logged(root)
+    flown = logged.write(tmp_path / "a.ulg", second_m=0.0)
+    (task,) = make_tasks(request_of(root, "flight-gap", flown=flown, group=PriorGroup.parse("gnss-known-s1")))
+    assert task.manifest.gnss == (
+        "drawn, 16.7 m on each axis, correlated over 60 s, in discs of 50 m: sensor_gps 0 is vehicle_gps_position 0 "
+        "under another name, which is the truth"
+    )
+    by_place = {}
+    for truth, prior, frame in discs_of(task):
+        away_m = np.hypot(*np.subtract(prior.center_m, (truth.pose.easting_m, truth.pose.northing_m)))
+        assert 0 < away_m <= prior.radius_m == 50.0
+        by_place.setdefault((truth.pair_id, frame), set()).add(prior.center_m)
+    assert {len(centers) for centers in by_place.values()} == {1}  # control and stress are asked alike
+    steps_m = np.diff([next(iter(by_place[key])) for key in sorted(by_place)], axis=0)
+    assert np.hypot(*steps_m.T).max() < 100  # views are 40 to 80 m apart, and errors of neighbours are alike
+
+
+@pytest.mark.slow
+def test_a_carried_drone_has_a_weak_receiver_on_both_ways(root) -> None:
+    (task,) = make_tasks(request_of(root, "flight-kidnap", group=PriorGroup.parse("gnss")))
+    kinds = set()
+    for truth, prior, _ in discs_of(task):
+        kinds.add(truth.kind)
+        away_m = np.hypot(*np.subtract(prior.center_m, (truth.pose.easting_m, truth.pose.northing_m)))
+        assert 0 < away_m <= prior.radius_m
+    assert any("F5" in kind for kind in kinds)
+
+
+def test_suites_without_flights_have_no_weak_receiver(root) -> None:
+    with pytest.raises(ConfigError, match="'clean' has no flights, of which prior group gnss-weak-s3 is: use r50 or"):
+        make_tasks(request_of(root, "clean", group=PriorGroup.parse("gnss")))

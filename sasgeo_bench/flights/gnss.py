@@ -55,12 +55,14 @@ class WeakGnss:
         """Return how far the views are from the middles of their discs, shape (N,), metres."""
         return np.asarray(np.hypot(*self.off_m.T))
 
-    def disc(self, at: int, place_m: tuple[float, float]) -> tuple[tuple[float, float] | None, float | None]:
-        """Return middle and radius of the disc of a view, to a decimetre; None without a fix."""
+    def disc(
+        self, at: int, place_m: tuple[float, float], *, least_m: float = 0.0
+    ) -> tuple[tuple[float, float] | None, float | None]:
+        """Return middle and radius of the disc of a view, to a decimetre and of a least radius; None without a fix."""
         if not math.isfinite(self.radius_m[at]):
             return None, None
         east_m, north_m = (round(float(one), 1) for one in np.asarray(place_m) + self.off_m[at])
-        return (east_m, north_m), round(float(self.radius_m[at]), 1)
+        return (east_m, north_m), round(max(float(self.radius_m[at]), least_m), 1)
 
 
 def draw_gnss(time_s: Floats, *, radius_m: float, rng: np.random.Generator) -> WeakGnss:

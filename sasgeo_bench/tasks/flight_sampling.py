@@ -23,6 +23,7 @@ from sasgeo_bench.geometry.pose import Pose, Prior, rotation
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import (
+    GNSS_M,
     SEQUENCE_DIGITS,
     TWIN_EAST,
     TWIN_NORTH,
@@ -455,7 +456,9 @@ class FlightDrawer:
             fix = None
             if gnss is not None:
                 place_m = views.position_m[frame, :2].tolist()
-                fix = gnss.disc(frame, (place_m[0], place_m[1]))
+                # The start's radius bounds what a tracker searches on the way, where a receiver soon states less
+                least_m = 0.0 if frame else GNSS_M
+                fix = gnss.disc(frame, (place_m[0], place_m[1]), least_m=least_m)
                 own |= {GNSS_OFF: round(float(gnss.away_m[frame]), 1)} if fix[0] is not None else {}
             yield self._view(job, pose_of(views, frame, flight.scale), step, measured=own | measured, fix=fix)
 

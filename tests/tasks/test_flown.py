@@ -309,13 +309,13 @@ def test_the_priors_of_a_flight_are_the_fixes_of_the_logs_second_receiver(root, 
     with reporting(print):
         (task,) = make_tasks(request_of(root, "flight-gap", flown=flown, group=PriorGroup.parse("gnss")))
     found = list(discs_of(task))
-    seen = [(truth, prior) for truth, prior, _ in found if prior.center_m is not None]
+    seen = [(truth, prior, frame) for truth, prior, frame in found if prior.center_m is not None]
     assert 0 < len(found) - len(seen) < len(found) / 3  # those of the middle have no fix
-    for truth, prior in seen:
+    for truth, prior, frame in seen:
         east, north = np.subtract(prior.center_m, (truth.pose.easting_m, truth.pose.northing_m))
         assert np.hypot(east, north) == pytest.approx(9.0, abs=0.3)
         assert east > 8.5
-        assert prior.radius_m == 15.0
+        assert prior.radius_m == (15.0 if frame else 50.0)
         assert truth.measured["gnss_off_m"] == pytest.approx(9.0, abs=0.3)
     assert {prior.yaw_sigma_deg for _, prior, frame in found if frame == 0} == {20.0}
     assert {prior.yaw_sigma_deg for _, prior, frame in found if frame > 0} == {None}

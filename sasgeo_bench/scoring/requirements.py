@@ -246,6 +246,8 @@ def _requirement(text: str) -> Requirement:
         figures = {LOCALIZATION: within_name(within_m, within_deg), SEQUENCE: _flown_name(within_m, within_deg)}
         return Requirement(text=text, bound=_share(match[1], what), is_least=True, figures=figures, own=own)
     if (match := _LATENCY.fullmatch(text)) is not None:
+        if not float(match[2]) > 0:
+            raise ConfigError(f"{what}: no answer comes within {match[2]} {match[3]}, give a time above 0")
         own = latency_metrics(_divided(match[2], 1000 if match[3] == "ms" else 1))
         figures = dict.fromkeys(TRACKS, own[0].metric.name)
         return Requirement(text=text, bound=_share(match[1], what), is_least=True, figures=figures, own=own)

@@ -82,6 +82,7 @@ def test_a_text_says_which_figure_must_be_how_large(text, bound, is_least, figur
         ("80% within 200 deg", "is no limit"),
         ("180% within 50 m", "180 is no share, which is above 0 and at most 100 %"),
         ("p95 latency 400", "which is no requirement"),
+        ("p95 latency 0 ms", "no answer comes within 0 ms, give a time above 0"),
         ("false >= 1%", "'false' is no metric"),
         ("continuity_60 >= 99%", "'continuity_60' is no metric: did you mean 'continuity_60s'?"),
         ("latency_p95 <= 1 s", "a metric without an interval on each suite"),

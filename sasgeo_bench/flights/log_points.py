@@ -41,6 +41,7 @@ _HIGHEST_ALTITUDE_M: Final = HIGHEST_M + 9_000.0  # above the highest ground
 _MOST_SHOWN: Final = 40  # characters of a text out of a file
 _ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
 _MOST_NAMES: Final = 12  # in a message
+_SPACED_ZONE: Final = re.compile(r"\s+(?=[-+]\d\d(?::?\d\d)?$)")  # ISO 8601 has no space before it
 _WGS84: Final = pyproj.Geod(ellps="WGS84")
 
 
@@ -79,7 +80,7 @@ class LogSource:
     def moment(self, text: str | None, number: int) -> float:
         """Return a time as ISO 8601 has it, in seconds since 1970; one without a zone is UTC."""
         try:
-            moment = dt.datetime.fromisoformat((text or "").strip())
+            moment = dt.datetime.fromisoformat(_SPACED_ZONE.sub("", (text or "").strip()))
         except ValueError as error:
             message = f"time is no date and time like 2025-05-01T10:00:00Z, {shown(text or '')}: mend it"
             raise self.fault(message, number) from error

@@ -42,6 +42,13 @@ OdometryFlag = Annotated[
         help="of the flight: that of its log where this fused no GNSS, or drawn by a profile of drift (drawn)"
     ),
 ]
+DriftFlag = Annotated[
+    str | None,
+    typer.Option(
+        help="profile of drift that the odometry of the flight declares, and is drawn by: a file of measure-drift "
+        "--profile, or a name, as vio-mono; default: that of the suite"
+    ),
+]
 VehicleFlag = Annotated[int | None, typer.Option(help="system id of the vehicle in a .tlog of several")]
 
 
@@ -93,6 +100,7 @@ class FlightOptions(Options):
     axes: AxesFlag = None
     vehicle: VehicleFlag = None
     odometry: OdometryFlag = "log"
+    drift: DriftFlag = None
     topic: Annotated[str | None, typer.Option(help="topic of a bag with odometry that fused no GNSS")] = None
 
     @property
@@ -121,6 +129,7 @@ class FlightOptions(Options):
             least_m=least_m,
             odometry=self.odometry,
             topic=self.topic,
+            drift=self.drift,
         )
 
 
@@ -155,7 +164,7 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
     """
     _check_outputs([options.file], [options.tum] if options.tum else [])
     if options.region is None:
-        for name in ("tum", "least_m", "dem", "takeoff_height", "topic", "odometry"):
+        for name in ("tum", "least_m", "dem", "takeoff_height", "topic", "odometry", "drift"):
             if getattr(options, name) not in (None, "log"):
                 raise FlightError(f"--{name.replace('_', '-')} needs --region: it is about the stretch over a region")
         if is_tum(options.file):

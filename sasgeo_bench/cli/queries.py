@@ -74,6 +74,13 @@ class QueryOptions(Options):
             help="of that flight: of its log where this fused no GNSS, or drawn by a profile of drift (drawn)"
         ),
     ] = "log"
+    drift: Annotated[
+        str | None,
+        typer.Option(
+            help="profile of drift that its odometry declares, and is drawn by: a file of measure-drift --profile, or "
+            "a name, as vio-mono; default: that of the suite"
+        ),
+    ] = None
     up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False
     skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False
@@ -137,11 +144,11 @@ def make_queries_command(options: QueryOptions) -> None:
 
 def _flown(options: QueryOptions) -> FlownPath | None:
     if options.flight is None:
-        for name, is_said in (("height", options.height is not None), ("odometry", options.odometry != "log")):
-            if is_said:
+        for name in ("height", "odometry", "drift"):
+            if getattr(options, name) not in (None, "log"):
                 raise ConfigError(f"--{name} is of a flight: name its log by --flight")
         return None
-    return FlownPath(file=options.flight, height_m=options.height, odometry=options.odometry)
+    return FlownPath(file=options.flight, height_m=options.height, odometry=options.odometry, drift=options.drift)
 
 
 def _folder(request: Request) -> Path:

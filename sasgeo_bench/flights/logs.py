@@ -19,6 +19,7 @@ from sasgeo_bench.core.errors import CameraError, FlightError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
+from sasgeo_bench.flights.drift_profile import DriftProfile, list_profiles, load_profile, read_drift_profile
 from sasgeo_bench.flights.gnss import SecondReceiver, second_receiver
 from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
 from sasgeo_bench.flights.log_dataflash import read_dataflash
@@ -250,7 +251,8 @@ class FlownPath:
     """The log of a flight that was flown, and what it does not say; `read_flight` says what each means.
 
     `odometry` is that of the log where no receiver was fused into it, or `drawn` by a profile all the way; `topic` has
-    it in a bag whose messages do not say what they fused.
+    it in a bag whose messages do not say what they fused. `drift` names the profile by which it is drawn and its noise
+    is declared: one that comes with the package, or a file.
     """
 
     file: Path
@@ -259,6 +261,7 @@ class FlownPath:
     least_m: float = SHORTEST_FLOWN_M
     odometry: OdometryOf = "log"
     topic: str | None = None
+    drift: str | None = None
 
     def __post_init__(self) -> None:
         if not self.file.is_file() and not is_bag(self.file):
@@ -274,7 +277,7 @@ class FlownPath:
         logs = sorted(self.file.iterdir()) if self.file.is_dir() else [self.file]
         files = [*map(sha256_of, logs), None if self.facts.dem is None else sha256_of(self.facts.dem)]
         asked = [*files, self.file.name, asdict(self.facts) | {"dem": None}, self.height_m, self.least_m]
-        asked += [self.odometry, self.topic]
+        asked += [self.odometry, self.topic, None if self.profile is None else self.profile.model_dump()]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 
     @cached_property
@@ -286,6 +289,13 @@ class FlownPath:
     def start_s(self) -> float | None:
         """When the log begins, seconds since 1970, UTC; None where it does not tell."""
         return None if self.log is None else self.log.start_s
+
+    @cached_property
+    def profile(self) -> DriftProfile | None:
+        """The profile of drift that `drift` names; None where it names none."""
+        if self.drift is None or self.drift in list_profiles():
+            return None if self.drift is None else load_profile(self.drift)
+        return read_drift_profile(Path(self.drift))
 
     def own_odometry(self) -> OwnOdometry:
         """Return the log's own odometry; raise `FlightError` that says why it has none that fused no GNSS."""

@@ -15,12 +15,9 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
-from sasgeo_bench.core.errors import ConfigError, FlightError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.core.folders import fresh_folder, locked
 from sasgeo_bench.core.progress import reporting, spread, tell
-from sasgeo_bench.flights.gnss import SecondReceiver
-from sasgeo_bench.flights.log_odometry import OwnOdometry
-from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import read_bits
@@ -29,12 +26,12 @@ from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.edited_maps import changed_maps, degraded_map, edit_maps, nothing_to_ask
-from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer, gnss_in_words, odometry_in_words
+from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer, LoggedFlight
 from sasgeo_bench.tasks.frames import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.pictured_ground import PicturedGround
 from sasgeo_bench.tasks.private_seed import seed_record
-from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup, Query, Truth, base_of
+from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
 from sasgeo_bench.tasks.split import Block, Split
 from sasgeo_bench.tasks.state import State
@@ -183,62 +180,21 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
     suite = replace(suite, variants=suite.usable(scene))
     if isinstance(suite, FlightSuite):
         over = base if scene.pictured is None else base.within(scene.pictured.footprint)
-        flown, own, why_drawn, receiver, why_no_receiver = None, None, "", None, "no log has it"
+        flown = None
         if request.flown is not None:
-            flown = request.flown.over(over, margin_m=suite.clear_m(scene))
-            own, why_drawn = _own_odometry(request.flown)
-            receiver, why_no_receiver = _second_receiver(request.flown, group)
+            flown = LoggedFlight.of(request.flown, over, margin_m=suite.clear_m(scene), group=group)
             seeds = seeds.under("flown", request.flown.key)  # another log has other ids: no answer fits both
         airspace = Airspace(
-            region=over,
-            scene=scene,
-            suite=suite,
-            split=request.split,
-            seeds=seeds,
-            group=group,
-            flown=flown,
-            start_s=None if request.flown is None else request.flown.start_s,
-            own=own,
-            receiver=receiver,
+            region=over, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group, flown=flown
         )
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
         airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))
-        odometry = None
-        if flown is not None:
-            odometry = odometry_in_words(flights[0], own, why_drawn)
-            tell(f"odometry: {odometry}")
-            if flights[0].has_own:
-                airspace = replace(airspace, suite=replace(suite, variants=suite.variants + suite.of_log))
-        gnss = None
-        if group.is_gnss:
-            gnss = gnss_in_words(next(iter(flights.values())), group, receiver, why_no_receiver)
-            tell(f"prior: fixes {gnss}")
-        pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice, odometry=odometry, gnss=gnss)
+        pilot = FlightDrawer.of(airspace, flights, request.choice)
         return pilot, [flight.site for flight in flights.values()]
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split, choice=request.choice)
     drawer, edited = edit_maps(request, drawer, base, sites)
     return drawer, list(edited)
-
-
-def _own_odometry(flown: FlownPath) -> tuple[OwnOdometry | None, str]:
-    """Return the odometry of a log, or why it has none; raise if it was asked for by name."""
-    try:
-        return flown.own_odometry(), ""
-    except FlightError as error:
-        if flown.topic is not None:
-            raise
-        return None, str(error)
-
-
-def _second_receiver(flown: FlownPath, group: PriorGroup) -> tuple[SecondReceiver | None, str]:
-    """Return a receiver of a log for the priors of a group, or why none is."""
-    if not group.is_gnss:
-        return None, ""
-    try:
-        return flown.second_receiver(), ""
-    except FlightError as error:
-        return None, str(error)
 
 
 def _view_reach_m(request: Request, suite: Suite) -> float:
@@ -418,9 +374,7 @@ def _origin(
     pictured = filter(None, (drawer.scene.pictured, drawer.scene.pictured_elsewhere))
     owners = "; ".join(dict.fromkeys(item.imagery.record.attribution for item in pictured))
     texts |= {"picture_attribution": owners} if owners else {}
-    if isinstance(drawer, FlightDrawer):
-        told = {"odometry": drawer.odometry, "gnss": drawer.gnss}
-        texts |= {name: text for name, text in told.items() if text is not None}
+    texts |= drawer.told if isinstance(drawer, FlightDrawer) else {}
     return TaskOrigin(
         suite=card.name,
         suite_version=card.version,

@@ -2,7 +2,7 @@
 """Flights of a suite over a region, and their queries and truths: views in order, with odometry between them."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Final
 
@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError, FlightError, counted
 from sasgeo_bench.core.progress import tell
-from sasgeo_bench.flights.drift_profile import load_profile
+from sasgeo_bench.flights.drift_profile import DriftProfile, load_profile
 from sasgeo_bench.flights.gnss import CORRELATION_S, SIGMAS, SecondReceiver, WeakGnss, draw_gnss
 from sasgeo_bench.flights.kinematics import fly
 from sasgeo_bench.flights.log_odometry import OwnOdometry
+from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.flights.odometry import LoggedSteps, Odometry, draw_odometry
 from sasgeo_bench.flights.plans import KINDS, PlanKind, flight_area, plan_flight
 from sasgeo_bench.flights.trajectory import Trajectory
@@ -95,37 +96,78 @@ class Flight:
         """Return the index of the view in the middle."""
         return len(self.views) // 2
 
-    @property
-    def has_own(self) -> bool:
-        """Return whether the log's odometry has any step between the views."""
-        return self.own is not None and bool(self.own.is_logged.any())
+
+@dataclass(frozen=True, kw_only=True)
+class LoggedFlight:
+    """A flight that was flown over a region, and what its log has besides, or why it has none.
+
+    Parameters
+    ----------
+    path : Trajectory
+        The longest stretch over the region.
+    start_s : float, optional
+        When its clock was 0, seconds since 1970, UTC, if that is known.
+    own : OwnOdometry or str
+        Odometry that fused no GNSS.
+    receiver : SecondReceiver or str
+        A weaker receiver beside that of the truth.
+    drift : DriftProfile, optional
+        What its odometer declares and is drawn by, where a suite is not about a profile; by default that of the suite.
+    """
+
+    path: Trajectory
+    start_s: float | None
+    own: OwnOdometry | str
+    receiver: SecondReceiver | str
+    drift: DriftProfile | None = None
+
+    @classmethod
+    def of(cls, flown: FlownPath, region: Region, *, margin_m: float, group: PriorGroup) -> "LoggedFlight":
+        """Read a log over a region; a receiver only where priors are of one."""
+        path = flown.over(region, margin_m=margin_m)
+        own: OwnOdometry | str
+        receiver: SecondReceiver | str = ""
+        try:
+            own = flown.own_odometry()
+        except FlightError as error:
+            if flown.topic is not None:  # which was asked for by name
+                raise
+            own = str(error)
+        if group.is_gnss:
+            try:
+                receiver = flown.second_receiver()
+            except FlightError as error:
+                receiver = str(error)
+        return cls(path=path, start_s=flown.start_s, own=own, receiver=receiver, drift=flown.profile)
+
+    def odometry_words(self, flight: Flight) -> str:
+        """Return where the odometry of the flight is from, and tell how far that of its log is off."""
+        name = Mission().profile if self.drift is None else self.drift.id
+        drawn = "profiles of drift" if self.drift is None else f"the profile {name}"
+        own, steps = self.own, flight.own
+        if isinstance(own, str) or steps is None:
+            return f"drawn by {drawn}: {own}"
+        if not steps.is_logged.any():
+            return f"drawn by {drawn}: {own.name} fused GNSS or has no poses along the flight ({own.told})"
+        off_pct, off_deg = steps.off(flight.views)
+        turned = "" if math.isnan(off_deg) else f" and its turns by {off_deg:.2g} deg"
+        tell(f"steps of {own.name} are off the receiver by {off_pct:.2g} % of the way{turned} (medians)")
+        words = own.where(steps)
+        if not steps.is_logged.all():
+            words += f", drawn by the profile {name} where it fused GNSS or has no poses ({own.told})"
+        if math.isnan(off_deg):
+            words += "; turns are drawn, as its headings are the vehicle's and so are those of the truth"
+        return f"{words}; noise is declared as the profile {name} has it"
 
 
-def odometry_in_words(flight: Flight, own: OwnOdometry | None, why_drawn: str) -> str:
-    """Return where the odometry of a flight that was flown is from, and tell how far that of its log is off."""
-    profile, steps = f"the profile {Mission().profile}", flight.own
-    if own is None or steps is None:
-        return f"drawn by profiles of drift: {why_drawn}"
-    if not flight.has_own:
-        return f"drawn by profiles of drift: {own.name} fused GNSS or has no poses along the flight ({own.told})"
-    off_pct, off_deg = steps.off(flight.views)
-    turned = "" if math.isnan(off_deg) else f" and its turns by {off_deg:.2g} deg"
-    tell(f"steps of {own.name} are off the receiver by {off_pct:.2g} % of the way{turned} (medians)")
-    words = own.where(steps)
-    if not steps.is_logged.all():
-        words += f", drawn by {profile} where it fused GNSS or has no poses ({own.told})"
-    if math.isnan(off_deg):
-        words += "; turns are drawn, as its headings are the vehicle's and so are those of the truth"
-    return f"{words}; noise is declared as {profile} has it"
-
-
-def gnss_in_words(flight: Flight, group: PriorGroup, receiver: SecondReceiver | None, why_drawn: str) -> str:
+def gnss_words(flight: Flight, group: PriorGroup, logged: LoggedFlight | None) -> str:
     """Return where the fixes of priors by a weak receiver are from, and tell how far those of a log are off."""
-    gnss = flight.gnss
-    if gnss is None or receiver is None or not np.isfinite(gnss.radius_m).any():
+    gnss, receiver = flight.gnss, "no log has it" if logged is None else logged.receiver
+    if isinstance(receiver, str) or gnss is None or not np.isfinite(gnss.radius_m).any():
         disc_m = group.radius_m or math.nan
+        why = receiver if isinstance(receiver, str) else f"{receiver.name} has no fix along the flight"
         drawn = f"drawn, {disc_m / SIGMAS:.3g} m on each axis, correlated over {CORRELATION_S:g} s"
-        return f"{drawn}, in discs of {disc_m:g} m: {why_drawn or 'the log has no fix along the flight'}"
+        return f"{drawn}, in discs of {disc_m:g} m: {why}"
     is_fix = np.isfinite(gnss.radius_m)
     away_m, radius_m = gnss.away_m[is_fix], gnss.radius_m[is_fix]
     tell(
@@ -147,9 +189,7 @@ def pose_of(views: Trajectory, frame: int, scale: float) -> Pose:
 class Airspace:
     """Where the flights of a suite may go, and the seeds of region and suite that they are drawn from.
 
-    `flown` is a flight that was flown there; it is the only one then. `start_s` is when its clock was 0, seconds since
-    1970, UTC, if that is known; `own` the odometry of its log, `receiver` a weaker one beside that of the truth, if it
-    has them.
+    `flown` is a flight that was flown there; it is the only one then.
     """
 
     region: Region
@@ -158,10 +198,7 @@ class Airspace:
     split: Split
     seeds: Seeds
     group: PriorGroup
-    flown: Trajectory | None = None
-    start_s: float | None = None
-    own: OwnOdometry | None = None
-    receiver: SecondReceiver | None = None
+    flown: LoggedFlight | None = None
 
     def seeds_of(self, index: int) -> Seeds:
         """Return the seeds of one flight."""
@@ -220,11 +257,11 @@ class Airspace:
         sigmas = float(np.clip(seeds.rng("scale").standard_normal(), -_SCALE_CUT, _SCALE_CUT))
         return 1.0 + self.group.scale_sigma * sigmas, float(seeds.rng("spacing").uniform(*self.suite.every_m))
 
-    def _logged(self, flown: Trajectory) -> Flight:
+    def _logged(self, flown: LoggedFlight) -> Flight:
         """Return the flight that was flown, or raise `ConfigError` that says why it cannot be asked."""
         seeds = self.seeds_of(0)
         scale, spacing_m = self._scale_and_spacing_m(seeds)
-        views = _spaced(flown, float(flown.distance_m[-1]), spacing_m, seeds.rng("path", "flown"))
+        views = _spaced(flown.path, float(flown.path.distance_m[-1]), spacing_m, seeds.rng("path", "flown"))
         where, plot = self.scene.map.region, None
         if not self._is_in_one_part(views):
             raise ConfigError(
@@ -244,10 +281,10 @@ class Airspace:
                 f"the flight over {where} sees too little that is mapped: {self.suite.card.min_density:.0%} are needed"
             )
         site = Site(index=0, pose=pose_of(views, 0, scale), block=self._block(views), density=0.0)
-        own = None if self.own is None else self.own.steps(views.time_s)
+        own = None if isinstance(flown.own, str) else flown.own.steps(views.time_s)
         gnss = None
-        if self.receiver is not None:
-            gnss = self.receiver.along(views.time_s, views.position_m[:, :2], epsg=self.scene.map.grid.epsg)
+        if not isinstance(flown.receiver, str):
+            gnss = flown.receiver.along(views.time_s, views.position_m[:, :2], epsg=self.scene.map.grid.epsg)
         return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot, own=own, gnss=gnss)
 
     def _plot(self, views: Trajectory, before: Sequence[Flight], rng: np.random.Generator) -> Plot | None:
@@ -346,15 +383,29 @@ _MOST_GAP: Final = 1 / 3  # of a flight
 class FlightDrawer:
     """Draw the flights of one suite on one region; `carried` caches where carried drones come from.
 
-    `odometry` and `gnss` say where that of a flight that was flown is from, and the fixes of priors by a weak receiver.
+    `told` says where odometry is from (`odometry`), and fixes of a weak receiver (`gnss`): fields of `TaskOrigin`.
     """
 
     airspace: Airspace
     flights: dict[int, Flight]
     choice: Choice = EVERYTHING
-    odometry: str | None = None
-    gnss: str | None = None
+    told: Mapping[str, str] = field(default_factory=dict)
     carried: dict[tuple[int, float], Trajectory | None] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, airspace: Airspace, flights: dict[int, Flight], choice: Choice) -> "FlightDrawer":
+        """Return what draws some flights, and tell where their odometry and their priors are from."""
+        told, suite, flown = {}, airspace.suite, airspace.flown
+        first = next(iter(flights.values()))
+        if flown is not None:
+            told["odometry"] = flown.odometry_words(first)
+            tell(f"odometry: {told['odometry']}")
+            if flown.drift is not None or (first.own is not None and first.own.is_logged.any()):
+                airspace = replace(airspace, suite=replace(suite, variants=suite.variants + suite.of_own))
+        if airspace.group.is_gnss:
+            told["gnss"] = gnss_words(first, airspace.group, flown)
+            tell(f"prior: fixes {told['gnss']}")
+        return cls(airspace=airspace, flights=flights, choice=choice, told=told)
 
     @property
     def suite(self) -> FlightSuite:
@@ -444,6 +495,7 @@ class FlightDrawer:
             distance_m = np.where(np.arange(len(views)) < flight.middle, distance_m, distance_m - carried_m)
         unseen, time_s = _unseen(flight, mission), views.time_s - views.time_s[0]
         gnss = self._gnss(flight, mission, before)
+        start_s = None if self.airspace.flown is None else self.airspace.flown.start_s
         for frame in range(len(views)):
             is_lost = mission.is_lost and frame == flight.middle
             step = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
@@ -451,8 +503,8 @@ class FlightDrawer:
             own = flown | {"is_seen": float(not unseen[frame])}
             if flight.own is not None and mission.takes_log and frame > 0:
                 own[LOGGED] = float(flight.own.is_logged[frame - 1] and (before is None or frame > flight.middle))
-            if self.airspace.start_s is not None:
-                own[UTC] = round(self.airspace.start_s + float(views.time_s[frame]), 3)
+            if start_s is not None:
+                own[UTC] = round(start_s + float(views.time_s[frame]), 3)
             fix = None
             if gnss is not None:
                 place_m = views.position_m[frame, :2].tolist()
@@ -465,6 +517,9 @@ class FlightDrawer:
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:
         """Return what the odometer says: to the middle and from there on what it says in the control."""
         seeds, profile, into = self._seeds(flight.site), load_profile(mission.profile), flight.middle - 1
+        flown = self.airspace.flown
+        if flown is not None and flown.drift is not None and mission.takes_log:
+            profile = flown.drift
         step, control = (
             draw_odometry(flown, profile, belief=mission.belief, rng=seeds.rng("odometry", mission.draw))
             for flown in (views, flight.views)

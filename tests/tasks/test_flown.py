@@ -12,6 +12,7 @@ import shapely
 
 from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.core.progress import reporting
+from sasgeo_bench.flights.drift_profile import SlipDrift, load_profile, write_drift_profile
 from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks, make_tasks
@@ -226,7 +227,7 @@ def test_steps_of_the_logs_own_odometer_are_asked_in_place_of_drawn_ones(root, t
     logged = Logged(root)
     with reporting(print):
         (task,) = make_tasks(request_of(root, flown=logged.write(tmp_path / "a.ulg", has_camera=True)))
-    steps = list(logged.heard(task, "F1 of the log"))
+    steps = list(logged.heard(task, "F1 own odometer"))
     count = len(steps)
     assert count > 10
     straight = 0
@@ -290,7 +291,29 @@ def test_an_estimate_that_fused_gnss_is_named_and_the_profile_taken(root, tmp_pa
     (task,) = make_tasks(request_of(root, flown=flown))
     assert task.manifest.odometry.startswith(f"drawn by profiles of drift: {why}")
     assert not any("is_logged" in truth.measured for truth in task.truths)
-    assert "F1 of the log" not in {truth.kind for truth in task.truths}
+    assert "F1 own odometer" not in {truth.kind for truth in task.truths}
+
+
+def test_a_profile_of_ones_own_is_what_the_odometer_declares_and_is_drawn_by(root, tmp_path) -> None:
+    logged = Logged(root)
+    mine = load_profile("wheel-poor").model_copy(update={"id": "mine", "slip": SlipDrift(sigma_pct=30.0, length_m=5.0)})
+    write_drift_profile(mine, tmp_path / "mine.toml")
+    flown = logged.write(tmp_path / "a.ulg", has_camera=True)
+    (task,) = make_tasks(request_of(root, flown=replace(flown, drift=str(tmp_path / "mine.toml"))))
+    for step, *_ in logged.heard(task, "F1 own odometer"):
+        right, up = step.increment[:2]
+        way_m = np.hypot(right, up)
+        ahead, u = np.array([right, up]) / way_m, way_m / 5.0
+        along_m2 = ahead @ np.reshape(step.covariance, (3, 3))[:2, :2] @ ahead
+        # 2 % of scale, and 30 % of slip over 5 m
+        assert along_m2 == pytest.approx(way_m**2 * (0.02**2 + 0.3**2 * 2 * (u - 1 + np.exp(-u)) / u**2), rel=1e-4)
+    assert task.manifest.odometry.endswith("noise is declared as the profile mine has it")
+    (task,) = make_tasks(request_of(root, "flight-gap", flown=replace(flown, odometry="drawn", drift="perfect")))
+    assert task.manifest.odometry == "drawn by the profile perfect: --odometry drawn says so"
+    for step, before, pose, _ in logged.heard(task, "no gap"):
+        assert step.increment == pytest.approx(moved(before, pose), abs=1e-6)
+    with pytest.raises(ConfigError, match=r"none\.toml cannot be read as a drift profile"):
+        make_tasks(request_of(root, flown=replace(flown, drift=str(tmp_path / "none.toml"))))
 
 
 # Priors of a weak receiver

@@ -63,7 +63,7 @@ class Mission:
         Names other draws of perception and odometry: variants of one name have the same.
     takes_log : bool
         Whether odometry of the log of a flight that was flown takes the place of what is drawn by the profile, where it
-        has some. A variant that is about a profile keeps it.
+        has some, and a profile of one's own that of this one. A variant that is about a profile keeps it.
     """
 
     profile: str = "vo-mono-survey"  # profile of the odometer where a suite is not about drift
@@ -87,12 +87,12 @@ def uneventful(variant: Variant) -> Mission:
 class FlightSuite(Suite):
     """A suite of flights: all variants at a site fly the same way, and `mission` says what happens on it.
 
-    `every_m` are the bounds of a flight's mean spacing of views, and `longest_m` of its length. Variants `of_log` are
-    added on a flight whose log has odometry of its own.
+    `every_m` are the bounds of a flight's mean spacing of views, and `longest_m` of its length. Variants `of_own` are
+    added on a flight that was flown with an odometer of its own: that of its log, or of a profile that was measured.
     """
 
     mission: Callable[[Variant], Mission] = uneventful
-    of_log: tuple[Variant, ...] = ()
+    of_own: tuple[Variant, ...] = ()
     every_m: tuple[float, float] = SPACING_M
     longest_m: float = max(LENGTHS_M)
 
@@ -447,11 +447,11 @@ FLIGHT_ALIAS: Final = FlightAliasSuite(
 
 PROFILES: Final = ("vo-mono-survey", "wheel-poor", "vio-stereo", "vio-mono")  # by their drift after kilometres
 _KIND: Final = "F1"
-_OF_LOG: Final = f"{_KIND} of the log"
+_OWN: Final = f"{_KIND} own odometer"
 
 
 def _clean_mission(variant: Variant) -> Mission:
-    if variant.kind == _OF_LOG:
+    if variant.kind == _OWN:
         return Mission()
     if variant.role == "stress":
         return Mission(profile=variant.kind.removeprefix(f"{_KIND} "), takes_log=False)
@@ -481,7 +481,7 @@ FLIGHT_CLEAN: Final = FlightSuite(
         Variant(role="falsifier", kind="no drift again"),
     ),
     mission=_clean_mission,
-    of_log=(Variant(role="stress", kind=_OF_LOG, strength=float(len(PROFILES) + 1)),),
+    of_own=(Variant(role="stress", kind=_OWN, strength=float(len(PROFILES) + 1)),),
 )
 
 

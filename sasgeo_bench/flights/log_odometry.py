@@ -150,18 +150,16 @@ class OwnOdometry:
         yaw_deg = yaws_deg(turned_at(turns, at_s).as_quat())
         place_m = poses.at(at_s)
         moved = np.diff(place_m[:, 1] + 1j * place_m[:, 0]) * np.exp(1j * np.radians(yaw_deg[:-1]))
-        begin_s, end_s = at_s[:-1], at_s[1:]
-        spans_s = [(max(one, poses.time_s[0]), min(other, poses.time_s[-1])) for one, other in estimate.free_s]
-        is_logged = np.any(
-            [(begin_s >= one) & (end_s <= other) for one, other in spans_s] or [begin_s < -np.inf], axis=0
-        )
+        begin_s, end_s, posed_s = at_s[:-1], at_s[1:], poses.time_s
+        is_logged = np.zeros(len(moved), dtype=bool)
+        for free_s, fused_s in estimate.free_s:
+            is_logged |= (begin_s >= max(free_s, posed_s[0])) & (end_s <= min(fused_s, posed_s[-1]))
         is_known = poses.knows(at_s) & turns.knows(at_s)
-        silent = np.flatnonzero(np.diff(poses.time_s) > LOST_S)
         is_lost = ~(is_known[:-1] & is_known[1:])
-        for one, other in zip(poses.time_s[silent], poses.time_s[silent + 1], strict=True):
-            is_lost |= (begin_s < other) & (end_s > one)
-        for reset_s in estimate.resets_s:
-            is_lost |= (begin_s < reset_s) & (reset_s <= end_s)
+        anew = np.searchsorted(posed_s, estimate.resets_s)  # nothing leads from the pose before to one of these
+        silent = np.flatnonzero(np.diff(posed_s) > LOST_S) + 1
+        for at in np.concatenate([silent, anew[(anew > 0) & (anew < len(posed_s))]]):
+            is_lost |= (begin_s < posed_s[at]) & (end_s > posed_s[at - 1])
         return LoggedSteps(
             right_m=moved.real,
             up_m=moved.imag,

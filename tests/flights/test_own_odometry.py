@@ -98,6 +98,9 @@ def test_a_step_over_a_silence_or_a_jump_that_the_camera_tells_is_lost(tmp_path:
     steps = steps_of(write(tmp_path / "a.ulg", ulog(silent)))
     assert steps.is_logged.tolist() == [True] * 5
     assert steps.is_lost.tolist() == [False, False, True, True, False]
+    between_s = np.array([44.0, 44.7, 44.9, 45.1, 46.0])  # poses are at 44.8 and 45: no line leads over the jump
+    steps = FlownPath(file=tmp_path / "a.ulg").own_odometry().steps(between_s)
+    assert steps.is_lost.tolist() == [False, True, True, False]
     late = camera(kept=lambda time_s: 9 < time_s < 70)
     steps = steps_of(write(tmp_path / "b.ulg", ulog(late)))
     assert steps.is_logged.tolist() == [False, True, True, True, False]

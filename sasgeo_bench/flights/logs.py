@@ -23,13 +23,13 @@ from sasgeo_bench.flights.drift_profile import DriftProfile, list_profiles, load
 from sasgeo_bench.flights.gnss import SecondReceiver, second_receiver
 from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
 from sasgeo_bench.flights.log_dataflash import read_dataflash
-from sasgeo_bench.flights.log_odometry import OwnOdometry, read_own
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
 from sasgeo_bench.flights.log_subtitles import read_srt
 from sasgeo_bench.flights.log_table import read_csv
 from sasgeo_bench.flights.log_telemetry import read_tlog
 from sasgeo_bench.flights.log_ulog import read_ulog
 from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
+from sasgeo_bench.flights.own_odometry import OwnOdometry, read_own
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum
 from sasgeo_bench.geometry.grid import Grid

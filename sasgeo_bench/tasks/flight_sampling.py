@@ -15,9 +15,9 @@ from sasgeo_bench.core.progress import tell
 from sasgeo_bench.flights.drift_profile import DriftProfile, load_profile
 from sasgeo_bench.flights.gnss import CORRELATION_S, SIGMAS, SecondReceiver, WeakGnss, draw_gnss
 from sasgeo_bench.flights.kinematics import fly
-from sasgeo_bench.flights.log_odometry import OwnOdometry
 from sasgeo_bench.flights.logs import FlownPath
 from sasgeo_bench.flights.odometry import LoggedSteps, Odometry, draw_odometry
+from sasgeo_bench.flights.own_odometry import OwnOdometry
 from sasgeo_bench.flights.plans import KINDS, PlanKind, flight_area, plan_flight
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Pose, Prior, rotation

@@ -56,8 +56,13 @@ def test_drawn_errors_have_the_stated_size_and_last_a_minute() -> None:
 
 # Second receivers
 
-pytest.importorskip("pyulog", reason="needs the extra [logs]")
-pytest.importorskip("pymavlink", reason="needs the extra [logs]")
+
+@pytest.fixture
+def readers() -> None:
+    """What reads logs of autopilots."""
+    pytest.importorskip("pyulog", reason="needs the extra [logs]")
+    pytest.importorskip("pymavlink", reason="needs the extra [logs]")
+
 
 EAST_DEG = 1e-4  # 7.6 m that the second receiver is off
 
@@ -94,6 +99,7 @@ def places_m(moments_s: np.ndarray) -> np.ndarray:
 MOMENTS_S = np.array([1.0, 20.3, 77.1, 110.0])
 
 
+@pytest.mark.usefixtures("readers")
 def test_the_disc_is_around_the_weaker_receiver_with_three_times_what_it_states(tmp_path: Path) -> None:
     path = write(tmp_path / "a.ulg", ulog(px4(weak())))
     receiver = FlownPath(file=path).second_receiver()
@@ -106,6 +112,7 @@ def test_the_disc_is_around_the_weaker_receiver_with_three_times_what_it_states(
     assert radius == 18.0
 
 
+@pytest.mark.usefixtures("readers")
 def test_a_moment_without_a_fix_has_no_disc(tmp_path: Path) -> None:
     rows = [row for at, row in enumerate(weak()) if not 95 < at < 115]  # for 4 s
     receiver = FlownPath(file=write(tmp_path / "a.ulg", ulog(px4(rows)))).second_receiver()
@@ -115,6 +122,7 @@ def test_a_moment_without_a_fix_has_no_disc(tmp_path: Path) -> None:
     assert gnss.disc(1, (0.0, 0.0)) == (None, None)
 
 
+@pytest.mark.usefixtures("readers")
 @pytest.mark.parametrize(
     ("log", "match"),
     [
@@ -136,6 +144,7 @@ def test_a_table_has_no_second_receiver(tmp_path: Path) -> None:
         FlownPath(file=tmp_path / "a.csv").second_receiver()
 
 
+@pytest.mark.usefixtures("readers")
 def test_second_receivers_of_other_autopilots_are_read_alike(tmp_path: Path) -> None:
     rows = ardupilot_rows(LEVEL)
     rows["GPS"] = [(*row[:2], 3, *row[3:]) for row in rows["GPS"]]
@@ -159,6 +168,7 @@ def test_second_receivers_of_other_autopilots_are_read_alike(tmp_path: Path) -> 
         np.testing.assert_allclose(gnss.radius_m, radius_m)
 
 
+@pytest.mark.usefixtures("readers")
 def test_the_second_topic_of_a_bag_is_read_on_the_clock_of_the_first(tmp_path: Path) -> None:
     pytest.importorskip("rosbags", reason="needs the extra [logs]")
     messages = mavros_messages(LEVEL)

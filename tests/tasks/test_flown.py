@@ -149,6 +149,7 @@ class Logged:
     scale = 1.04
 
     def __init__(self, root):
+        pytest.importorskip("pyulog", reason="needs the extra [logs]")
         manifest = read_manifest(root / "regions" / TOWN)
         way = shapely.LineString(corners(root))
         self.time_s = np.arange(0, way.length / 10, 0.2)

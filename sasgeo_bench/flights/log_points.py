@@ -41,6 +41,7 @@ _HIGHEST_ALTITUDE_M: Final = HIGHEST_M + 9_000.0  # above the highest ground
 _MOST_SHOWN: Final = 40  # characters of a text out of a file
 _ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
 _MOST_NAMES: Final = 12  # in a message
+_SPACED_ZONE: Final = re.compile(r"\s+(?=[-+]\d\d(?::?\d\d)?$)")  # ISO 8601 has no space before it
 _WGS84: Final = pyproj.Geod(ellps="WGS84")
 
 
@@ -79,7 +80,7 @@ class LogSource:
     def moment(self, text: str | None, number: int) -> float:
         """Return a time as ISO 8601 has it, in seconds since 1970; one without a zone is UTC."""
         try:
-            moment = dt.datetime.fromisoformat((text or "").strip())
+            moment = dt.datetime.fromisoformat(_SPACED_ZONE.sub("", (text or "").strip()))
         except ValueError as error:
             message = f"time is no date and time like 2025-05-01T10:00:00Z, {shown(text or '')}: mend it"
             raise self.fault(message, number) from error
@@ -112,6 +113,8 @@ class FlightLog:
         Seconds since `start_s`, strictly increasing.
     start_s : float, optional
         Seconds since 1970, UTC, at `time_s` 0; None where the file does not say its zone.
+    clock_s : float, optional
+        Seconds of the log's own clock at `time_s` 0, which its other messages count by; None where it has no other.
     height_m : ndarray, shape (N,), optional
         Height above the ground or the place of take-off, metres; never one above the sea.
     altitude_m : ndarray, shape (N,), optional
@@ -128,6 +131,7 @@ class FlightLog:
     lat_deg: Floats
     time_s: Floats | None = None
     start_s: float | None = None
+    clock_s: float | None = None
     height_m: Floats | None = None
     altitude_m: Floats | None = None
     altitude_of: AltitudeOf = "unknown"
@@ -187,6 +191,7 @@ class FlightLog:
             lat_deg=columns["lat_deg"],
             **{name: columns.get(name) for name in ("time_s", "height_m", "altitude_m", *_ANGLES)},
             start_s=start_s,
+            clock_s=None,
             altitude_of=altitude_of,
             notes=notes,
         )

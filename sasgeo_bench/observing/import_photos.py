@@ -126,6 +126,10 @@ class ImportRequest:
             )
         if self.sigma_m is not None and not 0 < self.sigma_m <= 100:
             raise ConfigError(f"--sigma lies above 0 and within 100 m, got {self.sigma_m!r}")
+        if self.group.is_gnss:
+            raise ConfigError(
+                f"--prior {self.group.name} is of drawn flights: for pictures take r50 or r100, as in r50-weak-s3"
+            )
         if self.log is not None and self.poses is not None:
             raise ConfigError("poses come from one source: give --poses or --track alone")
         if self.seed < 0:

@@ -330,6 +330,8 @@ WEEK, WEEK_S = 2364, 4 * 86_400 + 43_218  # of GPS, 18 s ahead of noon
     [
         ("time,lat,lon", lambda y, x, s: f"2025-05-01T12:00:0{s}Z,{y},{x}", NOON_S),
         ("time,lat,lon", lambda y, x, s: f"2025-05-01T14:00:0{s}+02:00,{y},{x}", NOON_S),
+        ("time,lat,lon", lambda y, x, s: f"2025-05-01 14:00:0{s}+02,{y},{x}", NOON_S),  # as PostgreSQL writes it
+        ("time,lat,lon", lambda y, x, s: f"2025-05-01 08:00:0{s}.0 -04,{y},{x}", NOON_S),
         ("time,lat,lon", lambda y, x, s: f"2025-05-01 12:00:0{s} UTC,{y},{x}", NOON_S),
         ("datetime(utc),lat,lon", lambda y, x, s: f"2025-05-01 12:00:0{s},{y},{x}", NOON_S),
         ("time,lat,lon", lambda y, x, s: f"2025-05-01 12:00:0{s},{y},{x}", None),  # of no zone

@@ -24,7 +24,7 @@ from sasgeo_bench.observing.pictures import OwnPicture
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights, PosedPicture
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.sensing.crops import drawn_crops
-from sasgeo_bench.tasks.query import TRUTH_SIGMA
+from sasgeo_bench.tasks.query import TRUTH_SIGMA, PriorGroup
 from sasgeo_bench.tasks.task_files import Task
 from tests import pose_files
 from tests.sensing import test_visual_odometry as plane
@@ -618,6 +618,7 @@ REFUSED = [
     ({"name": "My Photos"}, ConfigError, "is no name for a suite of your own"),
     ({"sigma_m": 0.0}, ConfigError, "--sigma lies above 0"),
     ({"seed": -1}, ConfigError, "--seed is 0 or more"),
+    ({"group": PriorGroup.parse("gnss")}, ConfigError, "for pictures take r50 or r100"),
     ({"region": Path("none")}, StoreError, "none"),
     ({"pictures": Path("none")}, ImageError, "there is no picture or folder none"),
     ({"poses": Path("none.csv")}, SasgeoError, "name a table of poses"),

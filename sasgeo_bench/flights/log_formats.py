@@ -482,7 +482,7 @@ def unread(header: Sequence[str], layout: Layout, read: Collection[str], *, has_
     known = {column.at for name, column in layout.fields.items() if name in read}
     known |= {column.at for column in (*others, *layout.hemispheres.values()) if column is not None}
     left = [at for at, name in enumerate(header) if at not in known and name.strip()]
-    is_altitude = any(_is_altitude(layout.keys[at]) for at in left)
+    is_altitude = "altitude" not in read and any(_is_altitude(layout.keys[at]) for at in left)
     why = "; an altitude is read if one column of them states its unit" if is_altitude else ""
     return (f"not read: {listed([header[at] for at in left])}{why}",) if left else ()
 

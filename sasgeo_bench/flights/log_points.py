@@ -91,6 +91,8 @@ class LogSource:
             raise FlightError(f"there is no flight log {self.path}: check the path")
         size = self.path.stat().st_size
         most = MOST_BYTES if most is None else most
+        if not size:
+            raise self.fault("is empty: copy it anew, or export more")
         if size > most:
             raise self.fault(f"{size} bytes, at most {most} are read: cut the log first")
 
@@ -270,7 +272,8 @@ def _check_places(source: LogSource, numbers: Sequence[int], columns: Mapping[st
         numbers,
         (np.abs(lon) <= 180) & (np.abs(lat) <= 90),  # the globe
         lambda at: (
-            f"latitude {lat[at]:g}, longitude {lon[at]:g} are no degrees on Earth: mend them, or delete the point"
+            f"latitude {lat[at]:.9g}, longitude {lon[at]:.9g} are no degrees on Earth (-90 to 90, -180 to 180): mend "
+            "them, or delete the point"
         ),
     )
     text = "latitude and longitude are 0, which is no fix: delete the points without a fix"

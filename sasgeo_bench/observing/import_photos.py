@@ -188,7 +188,7 @@ def write_tasks(
             return ""
         if off_m[one.name] == 0:
             return f"whose view is not wholly on the map {state.region}"
-        return f"that were taken {nearest} or more beside the map {state.region}"
+        return f"that were taken {nearest} or more beside the map {state.region} (name another --region)"
 
     swapped = any(one.name in off_m and _is_swapped(one, manifest) for one in found.pictures)
     found.leave_out(away)
@@ -318,7 +318,7 @@ class TaskWriter:
     def tell_failed(self) -> None:
         """Tell which pictures could not be decoded, and why."""
         for why, names in self.failed_by.items():
-            tell(f"left out: {named(names, 'picture')} {why}")
+            tell(f"left out: {named(sorted(names), 'picture')} {why}")
 
     def put(self, suite: str, pairs: Callable[[str], Pairs], of: Sequence[PosedPicture], more: str = "") -> Task:
         """Write one task; `more` is a sentence on what it is."""

@@ -4,6 +4,7 @@
 import datetime as dt
 import gzip
 import io
+import math
 import sys
 import zipfile
 from collections.abc import Callable
@@ -211,7 +212,8 @@ def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Cal
     ("text", "match"),
     [
         (_csv("lat,lon", "47.14,9.52"), "two points at least, the log has 1"),
-        ("", "no column of latitude and longitude, found none: name them lat_deg and lon_deg"),
+        ("", "is empty: copy it anew, or export more"),
+        ("\n", "no column of latitude and longitude, found none: name them lat_deg and lon_deg"),
         (_csv("x,y\x1b[31m,lat", "1,2,3"), r"no column of longitude, found 'x', 'y\?\[31m', 'lat'"),
         (_csv("lat,lon,GPS.lat", "1,2,3"), "latitude is ambiguous, columns 'lat', 'GPS.lat': keep one"),
         (_csv("lat,lon,yaw_deg,heading_rad", "1,2,3,4"), "yaw is ambiguous, columns 'yaw_deg', 'heading_rad'"),
@@ -407,6 +409,22 @@ def test_a_log_beside_a_region_is_refused_by_where_both_lie(written, region, row
     path = written("a.csv", _csv("lat,lon,time_s", *rows))
     with pytest.raises(FlightError, match=rf"a\.csv lies elsewhere, {where} .*, and town-grid at latitude 48\.\d+ to"):
         read_flight(path, region, height_m=100.0)
+
+
+@pytest.mark.parametrize(
+    ("head", "turn", "hint"),
+    [
+        ("lon,lat,time_s", lambda lon, lat: (lat, lon), "longitude and latitude seem to be swapped"),
+        ("lat,lon,time_s", lambda lon, lat: (math.radians(lat), math.radians(lon)), "or say --place-unit rad"),
+        ("lat,lon,time_s", lambda lon, lat: (lat - 1, lon), "take another region$"),
+    ],
+)
+def test_a_log_beside_a_region_whose_places_lie_on_it_otherwise_is_told_how(written, region, head, turn, hint) -> None:
+    west, south, east, north = region.manifest.bounds_lonlat
+    first, second = turn((west + east) / 2, (south + north) / 2)
+    rows = [f"{first!r},{second!r},{at * 100}" if not at else f"{first + 1e-4!r},{second!r},100" for at in range(2)]
+    with pytest.raises(FlightError, match=hint):
+        read_flight(written("a.csv", _csv(head, *rows)), region, height_m=100.0)
 
 
 def test_heights_come_from_the_log_or_are_given(written: Callable, region: Region) -> None:

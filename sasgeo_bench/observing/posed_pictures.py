@@ -363,8 +363,8 @@ def _in_one_zone(seen: Sequence[_Stand], found: PosedPictures) -> list[_Stand]:
         return list(seen)
     if None in counts:
         found.notes.append(
-            f"clocks: {counts[None]} of {counted(counts.total(), 'photo')} state no zone (EXIF's OffsetTimeOriginal): all "
-            "are taken to be of one"
+            f"clocks: {counts[None]} of {counted(counts.total(), 'photo')} state no zone (EXIF's OffsetTimeOriginal): "
+            "all are taken to be of one"
         )
         return list(seen)
     found.notes.append(f"clocks: photos of {len(counts)} zones, whose times are taken in UTC")

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights import log_points
+from sasgeo_bench.flights.log_points import steps_m
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import FlownPath, read_flight, read_log
 from sasgeo_bench.flights.plans import flight_area
@@ -155,6 +156,68 @@ def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(writt
     above_sea = read_log(written("b.kml", text.replace("relativeToGround", "absolute").replace("Z</when>", "</when>")))
     assert (above_sea.altitude_m.tolist(), above_sea.altitude_of) == ([60, 60, 60], "geoid")
     assert (above_sea.height_m, above_sea.start_s) == (None, None)  # a time without a zone
+
+
+def _kml_track(count: int, mode: str, *, up: str = " 60", first: int = 0) -> str:
+    ats = range(first, first + count)
+    whens = "".join(f"<when>2025-05-01T05:00:{at:02}-05:00</when>" for at in ats)
+    coords = "".join(f"<gx:coord>9.52 {47.14 + at / 1e4}{up}</gx:coord>" for at in ats)
+    return f"<gx:Track>{mode}{whens}{coords}</gx:Track>"
+
+
+RELATIVE = "<altitudeMode>relativeToGround</altitudeMode>"
+
+
+@pytest.mark.parametrize(
+    ("inner", "found"),
+    [
+        (_kml_track(3, RELATIVE), [60, 60, 60]),
+        (_kml_track(3, ""), None),  # what it counts from is not said
+        (_kml_track(3, "<altitudeMode>clampToGround</altitudeMode>"), None),
+        (_kml_track(3, "<gx:altitudeMode>relativeToSeaFloor</gx:altitudeMode>"), None),
+        (_kml_track(3, RELATIVE, up=""), None),
+        (_kml_track(3, RELATIVE).replace("60</gx:coord></gx:Track>", "</gx:coord></gx:Track>"), None),  # not of all
+        (_kml_track(1, RELATIVE), "a flight has two points at least, the log has 1"),
+        (_kml_track(1, RELATIVE) + _kml_track(3, RELATIVE, first=5), "2 lines or tracks, one is read"),
+    ],
+)
+def test_a_kml_track_keeps_every_time_and_heights_of_a_stated_mode_alone(written: Callable, inner, found) -> None:
+    path = written("a.kml", f'<kml xmlns:gx="http://www.google.com/kml/ext/2.2"><Placemark>{inner}</Placemark></kml>')
+    if isinstance(found, str):
+        assert found in _refused(path)
+        return
+    log = read_log(path)
+    assert log.time_s.tolist() == [0, 1, 2]
+    assert log.start_s == START.timestamp()  # of a zone west of Greenwich
+    assert (None if log.height_m is None else log.height_m.tolist()) == found
+
+
+@pytest.mark.parametrize("zone", ["Z", "-05:00", "+09:30"])
+def test_times_of_a_gpx_are_moments_in_any_zone(written: Callable, zone: str) -> None:
+    local = START + (dt.datetime.fromisoformat(f"2025-05-01T00:00:00{zone}").utcoffset() or dt.timedelta())
+    text = _gpx(_points())
+    for at in range(5):
+        here = (local + dt.timedelta(seconds=at)).strftime("%Y-%m-%dT%H:%M:%S")
+        text = text.replace(f"2025-05-01T10:00:0{at}Z", f"{here}{zone}")
+    log = read_log(written("a.gpx", text))
+    assert (log.start_s, log.time_s.tolist()) == (START.timestamp(), [0, 1, 2, 3, 4])
+
+
+@pytest.mark.parametrize("name", ["a.gpx", "a.csv"])
+def test_a_log_over_the_antimeridian_is_one_flight(written: Callable, name: str) -> None:
+    points = [((179.9995 + at * 1e-4 + 180) % 360 - 180, -16.5, at) for at in range(10)]
+    rows = [f"{at},{lat},{lon:.7f}" for lon, lat, at in points]
+    log = read_log(written(name, _gpx(points) if name == "a.gpx" else _csv("time_s,lat,lon", *rows)))
+    assert log.lon_deg.min() < -179.9 < 179.9 < log.lon_deg.max()
+    way_m = 1e-4 * np.pi / 180 * 6_378_137 * np.cos(np.radians(16.5))
+    assert steps_m(log.lon_deg, log.lat_deg) == pytest.approx(way_m, rel=1e-2)
+    path = written("b.csv", _csv("time_s,lat,lon", *(row.replace(",-179.", ",180.") for row in rows)))
+    assert "longitude 180.9" in _refused(path)
+
+
+def test_altitudes_below_the_sea_are_read(written: Callable) -> None:
+    log = read_log(written("a.gpx", _gpx(_points()).replace("<time>", "<ele>-412.5</ele><time>")))  # at the Dead Sea
+    assert log.altitude_m.tolist() == [-412.5] * 5
 
 
 def test_a_kmz_is_the_kml_in_its_root(written: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

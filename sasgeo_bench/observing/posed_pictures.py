@@ -22,7 +22,7 @@ from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.geometry.projection import to_grid
+from sasgeo_bench.geometry.projection import WGS84, to_grid
 from sasgeo_bench.observing.picture_poses import PicturePose, PoseTable, picture_heading_deg
 from sasgeo_bench.observing.pictures import (
     LEAST_M,
@@ -44,6 +44,7 @@ _TILT_SIGMA: Final = 0.0175  # metres to a metre of height: a gimbal is right to
 _SAME_SHAPE: Final = 0.01  # by which the aspects of a picture and of a smaller copy differ, from rounding
 _CELL_M: Final = 10.0  # of the lattice of heights; GLO-30 and SRTM have 30 m
 _NADIR_DEG: Final = 5.0  # of tilt: a camera that leans less looks straight down, but for the wind
+_FINE_M: Final = 0.5  # of a standard deviation, below which the datum of a place counts: plates move by 0.02 m a year
 _AROUND_M: Final = 400.0  # of ground around the cameras whose heights are read
 
 
@@ -176,6 +177,7 @@ def pose_pictures(
     found.notes += [f"{note} ({counted(count, 'picture')})" for note, count in headings.items()]
     found.notes += _clocks(seen)
     seen = _in_one_zone(seen, found)
+    found.notes += _datums(seen)
     ground = _ground(heights, seen, epsg, found) if seen else None
     for stand in seen:
         posed = _posed(stand, heights, ground)
@@ -354,6 +356,17 @@ def _clocks(seen: Sequence[_Stand]) -> list[str]:
         return []
     off = f"{float(np.median(odd)):+.0f} s (median) off EXIF at {len(odd)} of {counted(len(off_s), 'picture')}"
     return [f"clocks disagree: the table is {off}; the table's times are taken"]
+
+
+def _datums(seen: Sequence[_Stand]) -> list[str]:
+    """Return a line where places are so good that it counts by which datum they are, and none says so."""
+    fine = [stand for stand in seen if stand.sigma_m < _FINE_M and (stand.row is None or stand.row.epsg == WGS84)]
+    if not fine:
+        return []
+    return [
+        f"places of {counted(len(fine), 'picture')} are good to less than {_FINE_M:g} m, and taken as WGS 84 of the day: "
+        "those of a network in ETRS89, NAD83 or GDA2020 lie up to 2 m off, say its CRS by --poses and --epsg"
+    ]
 
 
 def _in_one_zone(seen: Sequence[_Stand], found: PosedPictures) -> list[_Stand]:

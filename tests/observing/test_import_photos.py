@@ -457,6 +457,9 @@ def test_photos_of_a_drone_need_no_table(towns, region, middle, tmp_path):
         assert truth.pose.yaw_deg == pytest.approx(30.0 + north_of_grid(region, *middle), abs=0.01)
         assert str(query.observed_on) == "2024-05-01"
     assert any("(loose.jpg) without a position (say --poses or --track" in line for line in lines)
+    assert any(
+        line.startswith("places of 1 picture are good to less than 0.5 m, and taken as WGS 84") for line in lines
+    )
     assert any("(flat.jpg) whose camera is not known (it has no focal length" in line for line in lines)
 
 

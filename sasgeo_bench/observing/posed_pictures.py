@@ -363,9 +363,9 @@ def _datums(seen: Sequence[_Stand]) -> list[str]:
     fine = [stand for stand in seen if stand.sigma_m < _FINE_M and (stand.row is None or stand.row.epsg == WGS84)]
     if not fine:
         return []
+    good = f"places of {counted(len(fine), 'picture')} are good to less than {_FINE_M:g} m, and taken as WGS 84"
     return [
-        f"places of {counted(len(fine), 'picture')} are good to less than {_FINE_M:g} m, and taken as WGS 84 of the day: "
-        "those of a network in ETRS89, NAD83 or GDA2020 lie up to 2 m off, say its CRS by --poses and --epsg"
+        f"{good} of the day: a network in ETRS89, NAD83 or GDA2020 lies up to 2 m off, say its CRS by --poses, --epsg"
     ]
 
 

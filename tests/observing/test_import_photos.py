@@ -606,6 +606,14 @@ def test_swapped_places_are_guessed_where_they_lie_on_the_map(region, middle, la
     cells[1:3] = cells[2:0:-1]
     with pytest.raises(ConfigError, match="longitude and latitude seem to be swapped"):
         quiet(laid([",".join(cells)]))
+    cells[1:3] = [str(math.radians(float(cell))) for cell in cells[2:0:-1]]
+    with pytest.raises(ConfigError, match="places seem to be in radians: call the columns lat_rad and lon_rad"):
+        quiet(laid([",".join(cells)]))
+    request = laid([",".join(cells)])
+    request.poses.write_text(request.poses.read_text().replace("lon,lat", "lon_rad,lat_rad"))
+    (task,), _ = quiet(request)
+    (truth,) = task.truths
+    assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.05)
 
 
 def test_altitudes_above_the_ellipsoid_are_no_heights_above_the_sea(region, middle, laid, tmp_path):

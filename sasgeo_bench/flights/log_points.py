@@ -378,6 +378,8 @@ def read_gpx(path: Path) -> FlightLog:
             elif name == "ele":
                 _add_altitude(lines[parent], element.text)
     kind, read = ("trk", track) if len(track) or not len(route) else ("rte", route)
+    if not len(read):
+        raise track.source.fault("holds no track or route: export that of the flight, or name the file by what it is")
     if counts[kind] > 1:
         raise track.source.fault(f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant")
     return read.log(altitude_of="unknown")
@@ -412,6 +414,8 @@ def read_kml(path: Path) -> FlightLog:
         elif name == opened:
             _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())
             opened = ""
+    if not lines:
+        raise source.fault("holds no line or track: export that of the flight, or name the file by what it is")
     if len(lines) != 1:
         raise source.fault(f"{len(lines)} lines or tracks, one is read: keep the one that is meant")
     return lines[0].log(altitude_of="geoid", has_zone=has_zone)

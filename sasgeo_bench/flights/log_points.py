@@ -414,10 +414,10 @@ def read_kml(path: Path) -> FlightLog:
         elif name == opened:
             _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())
             opened = ""
-    if not lines:
-        raise source.fault("holds no line or track: export that of the flight, or name the file by what it is")
     if len(lines) != 1:
-        raise source.fault(f"{len(lines)} lines or tracks, one is read: keep the one that is meant")
+        none = "holds no line or track: export that of the flight, or name the file by what it is"
+        several = f"{len(lines)} lines or tracks, one is read: keep the one that is meant"
+        raise source.fault(several if lines else none)
     return lines[0].log(altitude_of="geoid", has_zone=has_zone)
 
 

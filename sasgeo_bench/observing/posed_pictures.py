@@ -192,11 +192,13 @@ def pose_pictures(
 def reason_of(error: SasgeoError, path: Path) -> str:
     """Return the text of an error without the name of its picture or mask, so that like faults are counted together.
 
-    >>> reason_of(ImageError("photos/a.jpg is no JPEG"), Path("photos/a.jpg"))
+    >>> reason_of(ImageError("photos/1.jpg is no JPEG"), Path("photos/1.jpg"))
     'it is no JPEG'
+    >>> reason_of(ImageError("most of what 1.png holds is 1.5"), Path("photos/1.jpg"))
+    'most of what it holds is 1.5'
     """
     text = plain(str(error)).replace(plain(str(path)), "it").replace(plain(path.name), "it")
-    return re.sub(rf"(?<!\w){re.escape(plain(path.stem))}\.\w+", "it", text)[:160]
+    return re.sub(rf"(?<!\w){re.escape(plain(path.stem))}\.[A-Za-z]\w*", "it", text)[:160]
 
 
 def is_georeferenced(path: Path) -> bool:

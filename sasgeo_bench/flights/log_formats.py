@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Final
 
 from sasgeo_bench.flights.log_points import AltitudeOf, LogSource, listed, shown
-from sasgeo_bench.flights.log_units import WORDS, LogFacts
+from sasgeo_bench.flights.log_units import LEAST_FIX, WORDS, LogFacts
 
 QUANTITIES: Final = MappingProxyType(
     {
@@ -136,7 +136,7 @@ class Format:
     epoch: tuple[str, ...] = ()
     gps: tuple[str, ...] = ()
     counts: bool = False
-    fix: Mapping[str, float] = field(default_factory=lambda: {"fix_type": 2.0})
+    fix: Mapping[str, float] = field(default_factory=lambda: {"fix_type": LEAST_FIX})
     receiver: str = ""
     no_yaw: float | None = None
     is_sorted: bool = True
@@ -217,7 +217,7 @@ FORMATS: Final = (
         },
         altitudes={"alt": "geoid"},
         counts=True,
-        fix={"status": 2.0},
+        fix={"status": LEAST_FIX},
         receiver="i",
         no_yaw=0.0,
     ),

@@ -23,7 +23,6 @@ from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.flights.log_points import FlightLog, LogSource
 from sasgeo_bench.flights.log_streams import (
-    LEAST_FIX,
     MOST_LOG_BYTES,
     Clock,
     Estimate,
@@ -37,6 +36,7 @@ from sasgeo_bench.flights.log_streams import (
     quaternions_of_angles,
     quaternions_of_ned,
 )
+from sasgeo_bench.flights.log_units import LEAST_FIX
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, Floats]

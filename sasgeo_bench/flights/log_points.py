@@ -92,7 +92,7 @@ class LogSource:
         size = self.path.stat().st_size
         most = MOST_BYTES if most is None else most
         if not size:
-            raise self.fault("is empty: copy it anew, or export more")
+            raise self.fault("empty: copy it anew, or export more")
         if size > most:
             raise self.fault(f"{size} bytes, at most {most} are read: cut the log first")
 

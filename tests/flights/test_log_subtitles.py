@@ -211,7 +211,7 @@ FAULTS = {
         "time goes back by 9 s",
     ),
     "a jump": (block(1, MINI.replace("#", "3")) + block(2, MINI.replace("47.14000#", "48.0")), "moves at"),
-    "empty": ("", "is empty: copy it anew"),
+    "empty": ("", "empty: copy it anew"),
 }
 
 

@@ -275,7 +275,7 @@ def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Cal
     ("text", "match"),
     [
         (_csv("lat,lon", "47.14,9.52"), "two points at least, the log has 1"),
-        ("", "is empty: copy it anew, or export more"),
+        ("", "empty: copy it anew, or export more"),
         ("\n", "no column of latitude and longitude, found none: name them lat_deg and lon_deg"),
         (_csv("x,y\x1b[31m,lat", "1,2,3"), r"no column of longitude, found 'x', 'y\?\[31m', 'lat'"),
         (_csv("lat,lon,GPS.lat", "1,2,3"), "latitude is ambiguous, columns 'lat', 'GPS.lat': keep one"),

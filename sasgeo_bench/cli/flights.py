@@ -398,7 +398,10 @@ def _lines(log: FlightLog, speed_mps: float) -> Iterator[str]:
             what, _, unit = name.partition("_")
             yield f"{what} from {values.min():.1f} to {values.max():.1f} {unit}"
     lon, lat = log.lon_deg, log.lat_deg
-    yield f"longitude from {lon.min():.4f} to {lon.max():.4f}, latitude from {lat.min():.4f} to {lat.max():.4f} deg"
+    west, east = lon.min(), lon.max()
+    if east - west > 180:  # over the antimeridian
+        west, east = lon[lon > 0].min(), lon[lon <= 0].max()
+    yield f"longitude from {west:.4f} to {east:.4f}, latitude from {lat.min():.4f} to {lat.max():.4f} deg"
     if log.time_s is None:
         tell(f"no times: a flight has an even speed (--speed-mps, {speed_mps:g} m/s)")
     if log.height_m is None:

@@ -22,7 +22,6 @@ from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.flights.leap_seconds import GPS_EPOCH_S, WEEK_S, utc_of_gps
 from sasgeo_bench.flights.log_points import FlightLog, LogSource
 from sasgeo_bench.flights.log_streams import (
-    LEAST_FIX,
     MOST_LOG_BYTES,
     Clock,
     Estimate,
@@ -39,6 +38,7 @@ from sasgeo_bench.flights.log_streams import (
     resets_of,
     stated_of,
 )
+from sasgeo_bench.flights.log_units import LEAST_FIX
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, Floats]

@@ -92,6 +92,8 @@ class LogSource:
             raise FlightError(f"there is no flight log {self.path}: check the path")
         size = self.path.stat().st_size
         most = MOST_BYTES if most is None else most
+        if not size:
+            raise self.fault("empty: copy it anew, or export more")
         if size > most:
             raise self.fault(f"{size} bytes, at most {most} are read: cut the log first")
 
@@ -275,7 +277,8 @@ def _check_places(source: LogSource, numbers: Sequence[int], columns: Mapping[st
         numbers,
         (np.abs(lon) <= 180) & (np.abs(lat) <= 90),  # the globe
         lambda at: (
-            f"latitude {lat[at]:g}, longitude {lon[at]:g} are no degrees on Earth: mend them, or delete the point"
+            f"latitude {lat[at]:.9g}, longitude {lon[at]:.9g} are no degrees on Earth (-90 to 90, -180 to 180): mend "
+            "them, or delete the point"
         ),
     )
     text = "latitude and longitude are 0, which is no fix: delete the points without a fix"
@@ -380,6 +383,8 @@ def read_gpx(path: Path) -> FlightLog:
             elif name == "ele":
                 _add_altitude(lines[parent], element.text)
     kind, read = ("trk", track) if len(track) or not len(route) else ("rte", route)
+    if not len(read):
+        raise track.source.fault("holds no track or route: export that of the flight, or name the file by what it is")
     if counts[kind] > 1:
         raise track.source.fault(f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant")
     return read.log(altitude_of="unknown")
@@ -415,7 +420,9 @@ def read_kml(path: Path) -> FlightLog:
             _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())
             opened = ""
     if len(lines) != 1:
-        raise source.fault(f"{len(lines)} lines or tracks, one is read: keep the one that is meant")
+        none = "holds no line or track: export that of the flight, or name the file by what it is"
+        several = f"{len(lines)} lines or tracks, one is read: keep the one that is meant"
+        raise source.fault(several if lines else none)
     return lines[0].log(altitude_of="geoid", has_zone=has_zone)
 
 

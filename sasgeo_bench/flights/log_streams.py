@@ -25,7 +25,6 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 MOST_LOG_BYTES: Final = 2 * 2**30  # its readers keep no more than the streams they need
-LEAST_FIX: Final = 3  # of MAVLink, PX4 and ArduPilot alike: a place in three dimensions
 
 _MOST_APART_S: Final = 1.0  # from a fix to a height or an attitude that is its own
 _BEYOND_S: Final = 0.1  # two clocks of one computer agree so well

@@ -185,7 +185,7 @@ def _rows(source: LogSource) -> Iterator[tuple[int, list[str]]]:
                 is_begun = True
                 yield line, row
     except (OSError, UnicodeDecodeError) as error:
-        raise source.fault(f"no text in UTF-8 ({message_of(error)}): export it anew") from error
+        raise source.fault(f"no text in UTF-8 ({message_of(error)}): save it as CSV in UTF-8") from error
     except csv.Error as error:
         message = f"no sound CSV ({message_of(error)}): mend the line"
         raise source.fault(message, line + 1) from error

@@ -327,9 +327,20 @@ def _check_near(log: FlightLog, path: Path, region: Region) -> None:
         message = (
             f"{path.name} lies elsewhere, at latitude {lat.min():.4f} to {lat.max():.4f}, longitude {lon.min():.4f} to "
             f"{lon.max():.4f} degrees, and {region.manifest.id} at latitude {south:.4f} to {north:.4f}, longitude "
-            f"{west:.4f} to {east:.4f}: take another region"
+            f"{west:.4f} to {east:.4f}: take another region{_hint(log, region)}"
         )
         raise FlightError(plain(message))
+
+
+def _hint(log: FlightLog, region: Region) -> str:
+    """Return what a log beside a region may have wrong, if the middle of its points lies on it otherwise."""
+    west, south, east, north = region.manifest.bounds_lonlat
+    lon, lat = float(np.median(log.lon_deg)), float(np.median(log.lat_deg))
+    if west <= lat <= east and south <= lon <= north:
+        return ", or mend the log, whose longitude and latitude seem to be swapped"
+    if west <= math.degrees(lon) <= east and south <= math.degrees(lat) <= north:
+        return ", or say --place-unit rad, as its places seem to be in radians"
+    return ""
 
 
 def _above_ground(log: FlightLog, path: Path, en_m: Floats, manifest: Manifest, facts: LogFacts) -> Floats | None:

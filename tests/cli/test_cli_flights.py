@@ -121,6 +121,13 @@ def test_what_is_read_of_a_log_is_printed_with_its_columns_and_units(program, tm
     ]
 
 
+def test_a_flight_over_the_antimeridian_lies_from_west_to_east(program, tmp_path) -> None:
+    rows = [f"{at},-16.5,{lon}\n" for at, lon in enumerate((179.9998, 179.9999, 180.0, -179.9999, -179.9998))]
+    (tmp_path / "log.csv").write_text("time_s,lat,lon\n" + "".join(rows))
+    _, out, _ = program("import-flight", "log.csv")
+    assert out.splitlines()[-1] == "longitude from 179.9998 to -179.9998, latitude from -16.5000 to -16.5000 deg"
+
+
 def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_path) -> None:
     (tmp_path / "log.csv").write_text("t,lat,lon,height,heading\n" + ROWS)
     words: list[str] = []

@@ -51,6 +51,7 @@ def test_a_centre_and_a_size_make_a_grid_of_that_size_around_it_and_bounds_one_t
         ("bounds_lonlat = [9.0, 84.5, 9.1, 84.6]", "84"),
         ("bounds_lonlat = [9.0, 47.0, 9.0, 47.1]", "positive size"),
         ("bounds_lonlat = [nan, 47.0, 9.0, 47.1]", "within -180..180"),
+        ("center_lonlat = [190.0, 47.0]\nsize_m = [100, 100]", "within -180..180"),
         ("bounds_lonlat = [0.0, 40.0, 12.0, 50.0]", "make it smaller"),
         ("center_lonlat = [9.0, 47.0]\nsize_m = [1e6, 1e6]", "GB each"),
         ("center_lonlat = [9.0, 47.0]\nsize_m = [-5, 100]", "positive"),

@@ -195,9 +195,10 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
     (request,) = plan_requests(wanted)
     suite = request.found
     before = options.out / "tasks" / request.suite / request.region.id
-    if (before / TASK).is_file() and made_tasks(request) is None:
-        tell(f"{before} holds the queries of another flight or request, which are replaced (another --out keeps both)")
+    is_other = (before / TASK).is_file() and made_tasks(request) is None
     tasks = make_tasks(request)
+    if is_other:
+        tell(f"{before} held the queries of another flight or request: they are replaced (another --out keeps both)")
     kinds = ", ".join(dict.fromkeys(f"{truth.kind} ({truth.role})" for task in tasks for truth in task.truths))
     tell(f"the flight is asked once for each of: {kinds}")
     if not suite.is_pictured:

@@ -90,8 +90,12 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
         raise _meaningless(path, "has times", "--speed-mps")
     if height_m is None:
         return log
-    notes = (*log.notes, f"height: {height_m:g} m throughout, as --height says")
-    return replace(log, height_m=np.full(len(log), height_m), notes=notes)
+    heights_m, where = np.full(len(log), height_m), "throughout"
+    if log.height_m is not None and (is_flown := log.height_m >= LOWEST_M).any() and not is_flown.all():
+        # Where the log itself has the drone on the ground, it flew at no height that anyone says
+        heights_m, where = np.where(is_flown, height_m, log.height_m), f"where its own is {LOWEST_M:g} m at least"
+    notes = (*log.notes, f"height: {height_m:g} m {where}, as --height says")
+    return replace(log, height_m=heights_m, notes=notes)
 
 
 def read_places(path: Path, *, vehicle: int | None = None) -> Floats:

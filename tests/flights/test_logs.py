@@ -540,6 +540,25 @@ def test_what_is_on_the_ground_is_left_out(written: Callable, region: Region) ->
     assert flown.position_m[0, 0] == pytest.approx(places[105, 0], abs=2.1)
 
 
+@pytest.mark.parametrize(
+    ("own_m", "expected_m", "where"),
+    [
+        ((0, 4.9, 80, 90, 5, 0), (0, 4.9, 120, 120, 120, 0), "where its own is 5 m at least"),
+        ((1, 2, 1, 2, 1, 2), (120,) * 6, "throughout"),  # as of a log whose heights say nothing
+        ((50, 60, 50, 60, 50, 60), (120,) * 6, "throughout"),
+    ],
+)
+def test_a_height_that_is_said_is_that_of_the_flight_and_not_of_the_ground_before_it(
+    written: Callable, own_m: tuple[float, ...], expected_m: tuple[float, ...], where: str
+) -> None:
+    line = " ".join(f"9.52,{47.14 + at / 1e4:.4f},{height}" for at, height in enumerate(own_m))
+    shape = f"<coordinates>{line}</coordinates><altitudeMode>relativeToGround</altitudeMode>"
+    log = read_log(written("a.kml", f"<kml><LineString>{shape}</LineString></kml>"), height_m=120.0)
+    assert log.height_m is not None
+    assert log.height_m.tolist() == list(expected_m)
+    assert log.notes[-1] == f"height: 120 m {where}, as --height says"
+
+
 def test_yaw_of_a_log_is_turned_from_true_north_to_the_grid(written: Callable, region: Region) -> None:
     places = _across(region)
     path = written("a.csv", _table(region, places, more=",yaw_deg,pitch_deg,roll_deg", cells=",30,-8,4"))

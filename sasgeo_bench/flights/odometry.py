@@ -300,7 +300,8 @@ class LoggedSteps:
         ----------
         drawn : Odometry
             By a profile, of the same steps. Its turns stay where the log's odometer has no headings of its own: those
-            of the vehicle are the truth's, and would be turns without an error.
+            of the vehicle are the truth's, and would be turns without an error. Where such a turn is lost, so is its
+            step, and a reset in it is declared.
         profile : DriftProfile
             The noise that the odometer declares of each step.
         belief : {"honest", "optimistic"}
@@ -333,19 +334,24 @@ class LoggedSteps:
         >>> own.over(drawn, profile).up_m.tolist()
         [51.0, 50.0]
         """
-        moved = np.where(self.is_logged & ~self.is_lost, self.right_m + 1j * self.up_m, 0.0)
+        is_turned = np.isfinite(self.yaw_deg)
+        # A drawn turn is lost where it was drawn so, and its step with it
+        is_lost = np.where(self.is_logged & is_turned, self.is_lost, drawn.is_lost | (self.is_logged & self.is_lost))
+        is_own = self.is_logged & ~is_lost
+        moved = np.where(is_own, self.right_m + 1j * self.up_m, 0.0)
         law = _Law(profile=profile, steps_m=np.abs(moved))
         # 3: as of what is drawn
         declared = law.covariance(moved, np.zeros(len(moved), dtype=np.int64)) / (
             3.0**2 if belief == "optimistic" else 1.0
         )
-        declared[self.is_lost] = _LOST
-        turned = np.where(np.isfinite(self.yaw_deg), self.yaw_deg, drawn.yaw_deg)
-        is_lost = np.where(self.is_logged, self.is_lost, drawn.is_lost)
+        # A drawn turn may hold a reset, of which the odometer knows
+        turn_deg2 = np.where(is_turned, 0.0, drawn.covariance[:, 2, 2])
+        declared[:, 2, 2] = np.maximum(declared[:, 2, 2], turn_deg2)
+        declared[is_lost] = _LOST
         return Odometry(
             right_m=np.where(self.is_logged, moved.real, drawn.right_m),
             up_m=np.where(self.is_logged, moved.imag, drawn.up_m),
-            yaw_deg=np.where(is_lost, 0.0, np.where(self.is_logged, turned, drawn.yaw_deg)),
+            yaw_deg=np.where(is_lost, 0.0, np.where(self.is_logged & is_turned, self.yaw_deg, drawn.yaw_deg)),
             covariance=np.where(self.is_logged[:, None, None], declared, drawn.covariance),
             is_lost=is_lost,
         )

@@ -146,6 +146,36 @@ def test_a_step_that_the_log_has_not_stays_as_it_was_drawn(tmp_path: Path) -> No
     np.testing.assert_array_equal(own.yaw_deg, drawn.yaw_deg)  # without a heading of its own its turns are drawn
 
 
+def test_a_drawn_turn_that_is_lost_or_holds_a_reset_is_not_said_to_be_sound() -> None:
+    """An odometer without headings of its own turns as is drawn, by a profile that loses its way and jumps."""
+    time_s = np.arange(0.0, 400.0, 5.0)
+    yaw_deg = 12.0 * np.arange(len(time_s))
+    east, north = 50 * np.cumsum([np.sin(np.radians(yaw_deg)), np.cos(np.radians(yaw_deg))], axis=1)
+    flown = Trajectory.of_angles(
+        time_s=time_s, position_m=np.stack([east, north, 80 + 0 * east], axis=1), yaw_deg=yaw_deg
+    )
+    perfect = load_profile("perfect")
+    rare = perfect.resets.model_copy(update={"per_km": 2.0, "yaw_deg": 30.0})
+    silent = perfect.dropouts.model_copy(update={"per_km": 1.0, "length_m": 150.0})
+    profile = perfect.model_copy(update={"resets": rare, "dropouts": silent})
+    drawn = draw_odometry(flown, profile, rng=np.random.default_rng(0))
+    count = len(time_s) - 1
+    assert 0 < drawn.is_lost.sum() < count / 2
+    every = np.ones(count, dtype=bool)
+    own = LoggedSteps(
+        right_m=np.zeros(count),
+        up_m=np.full(count, 50.0),
+        yaw_deg=np.full(count, np.nan),
+        is_logged=every,
+        is_lost=~every,
+    ).over(drawn, profile)
+    np.testing.assert_array_equal(own.is_lost, drawn.is_lost)
+    assert (own.covariance[drawn.is_lost, 0, 0] == LOST_M**2).all()
+    off_deg = np.abs((own.yaw_deg - 12.0 + 180) % 360 - 180)[~own.is_lost]
+    assert (off_deg > 10).any()
+    assert (off_deg <= 4 * np.sqrt(own.covariance[~own.is_lost, 2, 2])).all()
+
+
 @pytest.mark.parametrize("moved_s", [0.0, 40.0])
 def test_the_first_fix_of_the_flight_is_where_its_clock_begins(tmp_path: Path, moved_s: float) -> None:
     """Fixes come later than poses, which count by the same clock."""

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -44,6 +44,7 @@ AGREEING: Final = 3  # accepted fixes in a row that confirm the last of them
 _NEEDED: Final = frozenset({"distance_m", "time_s"})  # measured at each view
 _JUMP_M: Final = 1.0  # more between two views than was flown: the drone was carried
 
+ConfirmedKind = Literal["right_confirmed", "false_confirmed", "false_of_confirmed"]
 Complexes = NDArray[np.complex128]  # east + i north, metres
 
 
@@ -482,17 +483,19 @@ def _accepted_at(views: pd.DataFrame) -> tuple[Floats, Bools]:
     return views["time_s"].to_numpy(float), views["is_accepted"].to_numpy(bool)
 
 
-def confirmed_by_flight(views: pd.DataFrame, *, count: int, near_m: float, is_false: bool) -> dict[str, float]:
+def confirmed_by_flight(views: pd.DataFrame, *, count: int, near_m: float, kind: ConfirmedKind) -> dict[str, float]:
     """Return by flight what a rule of `count` accepted fixes in a row gives that agree within `near_m` metres.
 
-    It is the share of its views with a confirmed fix within 25 m, or of its confirmed fixes that are beyond
-    (`is_false`), 0 where none is confirmed. `views` are rows of `view_frame`.
+    It is the share of its views with a confirmed fix within 25 m (`right_confirmed`) or beyond (`false_confirmed`), or
+    the share of its confirmed fixes that are beyond (`false_of_confirmed`), 0 where none is confirmed. `views` are rows
+    of `view_frame`.
     """
     found = {}
     for name, part in flights_in(views):
         confirmed, is_right = _Reckoned.of(part).confirmed(count, near_m), part["error_m"].to_numpy(float) <= FIX_M
-        beyond = float((confirmed & ~is_right).sum() / max(1, confirmed.sum()))
-        found[name] = beyond if is_false else float((confirmed & is_right).mean())
+        counted = confirmed & (is_right if kind == "right_confirmed" else ~is_right)
+        of = max(1, int(confirmed.sum())) if kind == "false_of_confirmed" else len(part)
+        found[name] = float(counted.sum() / of)
     return found
 
 

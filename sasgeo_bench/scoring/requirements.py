@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 import pandas as pd
@@ -16,7 +16,13 @@ import pandas as pd
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.cost import latencies_s
-from sasgeo_bench.scoring.flights import available_by_flight, confirmed_by_flight, continuous_by_flight, share_within
+from sasgeo_bench.scoring.flights import (
+    ConfirmedKind,
+    available_by_flight,
+    confirmed_by_flight,
+    continuous_by_flight,
+    share_within,
+)
 from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, REJECTOR, TRACK, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import Interval
 from sasgeo_bench.scoring.metric import MeanMetric, Metric, QuantileMetric, ThresholdMetric
@@ -46,9 +52,11 @@ _LIMIT: Final = re.compile(rf"\s*{_NUMBER}\s*(m|deg)\s*")
 _SHARE_WITHIN: Final = re.compile(rf"{_NUMBER}\s*%\s*within\s+(.+)")
 _LATENCY: Final = re.compile(rf"p{_NUMBER}\s+latency\s+{_NUMBER}\s*(ms|s)")
 _FIGURE: Final = re.compile(rf"([a-z][\w.]*)\s*(<=|>=)\s*{_NUMBER}\s*(\S*)")
+_CONFIRMED: Final[tuple[ConfirmedKind, ...]] = get_args(ConfirmedKind)
 _OF_FLIGHTS: Final = re.compile(
-    rf"(available|continuity)_{_NUMBER}s|(right_confirmed|false_of_confirmed)_([2-9]|[1-9][0-9])x{_NUMBER}m"
+    rf"(available|continuity)_{_NUMBER}s|({'|'.join(_CONFIRMED)})_([2-9]|[1-9][0-9])x{_NUMBER}m"
 )
+_FALSE_OF: Final = re.compile(r"false_of_(accepted|confirmed\S*)")
 _UNITS: Final = {"": ("1", 1), "%": ("1", 100), "ms": ("s", 1000)}  # as written -> of the metric, and how many make one
 _EXAMPLES: Final = (
     "'80% within 50 m', '50% within 5 m and 2 deg', 'p95 latency 400 ms', 'false <= 1%', or a metric as in "
@@ -156,8 +164,8 @@ def flown_metric(name: str) -> OwnMetric | None:
     """Return a metric of flights whose name holds constants of one's own; None for any other name.
 
     `available_45s` asks for fixes that are 45 s old at most, `continuity_120s` for one all along the next 120 s (of 30
-    s at most), `right_confirmed_5x10m` and `false_of_confirmed_5x10m` for 5 accepted fixes in a row that agree within
-    10 m.
+    s at most), `right_confirmed_5x10m`, `false_confirmed_5x10m` and `false_of_confirmed_5x10m` for 5 accepted fixes in
+    a row that agree within 10 m.
 
     >>> found = [flown_metric(name) for name in ("available_45s", "right_confirmed_5x10m", "available_long")]
     >>> [own and own.metric.name for own in found]
@@ -176,8 +184,8 @@ def flown_metric(name: str) -> OwnMetric | None:
         of_views = partial(continuous_by_flight, holds_s=float(seconds))
     else:
         like, says = kind, f"confirmed by {count} accepted ones in a row that agree within {metres} m"
-        is_false = kind == "false_of_confirmed"
-        of_views = partial(confirmed_by_flight, count=int(count), near_m=float(metres), is_false=is_false)
+        what = next(one for one in _CONFIRMED if one == kind)
+        of_views = partial(confirmed_by_flight, count=int(count), near_m=float(metres), kind=what)
     shipped = _SHIPPED[like]
     assert isinstance(shipped, MeanMetric)  # noqa: S101 - by their table
     values, counts = partial(_read, name=name), partial(_is_known, name=name)
@@ -313,7 +321,7 @@ def _requirement(text: str) -> Requirement:
             f"{what}, and {name} lies within {least:g} and {most:g}: give a bound that it may keep or miss"
         )
     tracks = metric.tracks if isinstance(metric, MeanMetric) else _tracks_of(metric)
-    own = () if own_one is None else (own_one,)
+    own = () if own_one is None else (own_one, *filter(None, map(flown_metric, _beside(name))))
     return Requirement(text=text, bound=bound, is_least=is_least, figures=dict.fromkeys(tracks, name), own=own)
 
 
@@ -356,7 +364,9 @@ class Compliance:
     bound: Annotated[float, "The bound"]
     is_least: Annotated[bool, "The figure must be the bound at least, and not at most"]
     figure: Annotated[Interval, "The figure; NaN where the board has none"]
-    accepted: Annotated[float, "Share of the queries, or views, that are accepted; NaN where all answers count"]
+    accepted: Annotated[
+        float, "Share of the queries, or views, that are accepted or confirmed; NaN where all answers count"
+    ]
     verdict: Annotated[
         str,
         Shown(
@@ -432,12 +442,16 @@ def _of_entry(requirement: Requirement, part: pd.DataFrame, *, is_timed: bool) -
         )
 
 
+def _beside(name: str) -> tuple[str, ...]:
+    """Return the shares that add up to that of the accepted answers which a figure is of; none if it is of all."""
+    if name.startswith("risk_reached_at_"):
+        return (name.replace("risk_reached_at_", "coverage_at_risk_"),)
+    match = _FALSE_OF.fullmatch(name)
+    return () if match is None else (f"right_{match[1]}", f"false_{match[1]}")
+
+
 def _accepted(part: pd.DataFrame, name: str, rejector: str, stratum: str) -> float:
     """Return the share of accepted answers where a figure is of these alone, else NaN."""
-    beside: tuple[str, ...] = ()
-    if name.startswith("risk_reached_at_"):
-        beside = (name.replace("risk_reached_at_", "coverage_at_risk_"),)
-    elif name == "false_of_accepted":
-        beside = ("right_accepted", "false_accepted")
+    beside = _beside(name)
     rows = part[part["metric"].isin(beside) & (part["rejector"] == rejector) & (part["stratum"] == stratum)]
     return float(np.sum(rows["value"])) if len(rows) else math.nan

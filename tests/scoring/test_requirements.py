@@ -71,7 +71,10 @@ def test_a_text_says_which_figure_must_be_how_large(text, bound, is_least, figur
     (found,) = parse_requirements([text])
     assert (found.bound, found.is_least, dict(found.figures)) == (pytest.approx(bound), is_least, figures)
     shipped = {metric.name for metric in METRICS}
-    assert {own.metric.name for own in found.own} == set(figures.values()) - shipped
+    added = {own.metric.name for own in found.own}
+    asked = set(figures.values()) - shipped
+    beside = {one.replace("false_of", side) for one in asked if "false_of" in one for side in ("right", "false")}
+    assert added == asked | beside
 
 
 @pytest.mark.parametrize(
@@ -231,13 +234,27 @@ def test_limits_of_flights_are_of_the_way_and_of_all_views_of_a_flight():
     assert found.loc["false <= 60%", "accepted"] == pytest.approx(1.0)
 
 
-def test_a_tracker_that_accepts_nothing_is_not_shown_to_be_right():
+@pytest.mark.parametrize("text", ["false <= 50%", "false_of_confirmed <= 50%", "false_of_confirmed_5x10m <= 50%"])
+@pytest.mark.parametrize("off_m", [0.0, 60.0])
+def test_a_tracker_that_accepts_nothing_is_not_shown_to_be_right(text, off_m):
     heads, truths = ([one for at in range(12) for one in a_flight(11, f"f{at:02}")[part]] for part in (0, 1))
-    scored = score_flights(heads, truths, answers(truths, accepted=[False] * len(truths)))
-    requirements = parse_requirements(["false <= 50%"])
-    (row,) = compliance_frame(requirements, board_of({"mine": scored.flights}, requirements)).to_dict("records")
+    requirements = parse_requirements([text])
+
+    def row_of(accepted):
+        given = answers(truths, accepted=[accepted] * len(truths), off_m=[off_m] * len(truths))
+        scored = score_flights(heads, truths, given)
+        board = board_of({"mine": scored.flights}, requirements, {"mine": scored.views})
+        (row,) = compliance_frame(requirements, board).to_dict("records")
+        return row
+
+    row = row_of(accepted=False)
     assert (row["figure"], row["accepted"], row["verdict"]) == (0.0, 0.0, NOT_SHOWN)
     assert row["figure_hi"] < 0.5  # of the interval alone it would pass
+    row = row_of(accepted=True)
+    # Of 11 views the first 2 are not confirmed by 3, nor the first 4 by 5
+    agreeing = {"false <= 50%": 1, "false_of_confirmed <= 50%": 3}.get(text, 5)
+    assert row["accepted"] == pytest.approx((12 - agreeing) / 11)
+    assert (row["figure"], row["verdict"]) == ((1.0, FAILS) if off_m else (0.0, PASSES))
 
 
 def flights(seed=0):
@@ -279,6 +296,7 @@ def test_a_rule_of_ones_own_confirms_fixes_in_a_row_that_agree(count, near_m):
     views = flights(1)
     right = flown_metric(f"right_confirmed_{count}x{near_m}m").of_views(views)
     false = flown_metric(f"false_of_confirmed_{count}x{near_m}m").of_views(views)
+    views_false = flown_metric(f"false_confirmed_{count}x{near_m}m").of_views(views)
     for name, part in views.groupby("sequence_id"):
         fixes = [(at, row.east_m) for at, row in enumerate(part.itertuples()) if row.is_accepted]
         # The odometer is exact and all head north: fixes agree if they are off alike.
@@ -290,6 +308,7 @@ def test_a_rule_of_ones_own_confirms_fixes_in_a_row_that_agree(count, near_m):
         wrong = sum(off_m > 25 for _, off_m in confirmed)
         assert right[name] == pytest.approx((len(confirmed) - wrong) / len(part))
         assert false[name] == pytest.approx(wrong / max(1, len(confirmed)))
+        assert views_false[name] == pytest.approx(wrong / len(part))
 
 
 @pytest.mark.parametrize(

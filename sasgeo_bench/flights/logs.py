@@ -170,7 +170,7 @@ def read_flight(
     least_m : float
         Shortest stretch that is taken, metres.
     height_m : float, optional
-        Height above the ground that is kept throughout, 5 to 10,000 m; it replaces the heights in the log.
+        Height above the ground that is kept in the air, 5 to 10,000 m; it replaces the heights in the log.
     facts : LogFacts, optional
         What the file does not say: units of a table, axes of a TUM file, the speed of a log without times (10 m/s).
     step_s : float
@@ -242,6 +242,8 @@ def _over(log: FlightLog | None, path: Path, region: Region, cut: _Cut) -> Traje
         _check_near(log, path, region)
         logged = _on_grid(log, path, region.manifest, facts or LogFacts())
     flown = _resampled(logged, path, step_s)
+    if cut.height_m is not None:  # between a point on the ground and one in the air nothing climbs through that height
+        flown = _at_height(flown, np.where(flown.position_m[:, 2] >= LOWEST_M, cut.height_m, flown.position_m[:, 2]))
     is_known = np.ones(len(flown) - 1, dtype=bool)
     if log is None or log.time_s is not None:
         is_known = ~_in_gaps(flown.time_s, logged.time_s)
@@ -400,8 +402,8 @@ def _on_grid(log: FlightLog, path: Path, manifest: Manifest, facts: LogFacts) ->
     )
 
 
-def _at_height(flown: Trajectory, height_m: float) -> Trajectory:
-    position_m = np.column_stack([flown.position_m[:, :2], np.full(len(flown), height_m)])
+def _at_height(flown: Trajectory, height_m: float | Floats) -> Trajectory:
+    position_m = np.column_stack([flown.position_m[:, :2], np.broadcast_to(height_m, len(flown))])
     return Trajectory(time_s=flown.time_s, position_m=position_m, quaternion_xyzw=flown.quaternion_xyzw)
 
 

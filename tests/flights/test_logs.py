@@ -559,6 +559,17 @@ def test_a_height_that_is_said_is_that_of_the_flight_and_not_of_the_ground_befor
     assert log.notes[-1] == f"height: 120 m {where}, as --height says"
 
 
+def test_nothing_climbs_to_a_height_that_is_said(written: Callable, region: Region) -> None:
+    """From a point at 3 m on the ground to the next one, at 6 m and flown at 100, no pose is at 40 m."""
+    places = _lonlat(region, _across(region))
+    up_m = np.clip(3.0 * np.arange(-100, len(places) - 100), 0, 90)
+    line = " ".join(f"{lon:.8f},{lat:.8f},{up:g}" for (lon, lat), up in zip(places, up_m, strict=True))
+    shape = f"<coordinates>{line}</coordinates><altitudeMode>relativeToGround</altitudeMode>"
+    path = written("a.kml", f"<kml><LineString>{shape}</LineString></kml>")
+    flown = read_flight(path, region, height_m=100.0, facts=LogFacts(speed_mps=8.0))
+    assert np.unique(flown.position_m[:, 2]).tolist() == [100.0]
+
+
 def test_yaw_of_a_log_is_turned_from_true_north_to_the_grid(written: Callable, region: Region) -> None:
     places = _across(region)
     path = written("a.csv", _table(region, places, more=",yaw_deg,pitch_deg,roll_deg", cells=",30,-8,4"))

@@ -29,6 +29,7 @@ CORRELATION_S: Final = 60.0  # of drawn errors, as PX4's receiver has it in Gaze
 _ROUNDED_M: Final = 0.1  # of a disc, to which its middle is rounded
 _LEAST_M: Final = 1.0  # radius of a disc, whatever is stated
 _COPY_M: Final = 0.05  # two receivers differ by more
+_COPIED: Final = 0.1  # of the fixes, at most; an autopilot may choose now one of its receivers, now the other
 _READERS: Final = MappingProxyType(
     {".ulg": log_ulog.read_receivers, ".bin": log_dataflash.read_receivers, ".log": log_dataflash.read_receivers}
 )
@@ -180,8 +181,10 @@ def _why_not(one: Fixes, truth: Fixes) -> str | None:
     lon, lat = one.track.at(time_s).T[:2]
     true_lon, true_lat = truth.track.at(time_s).T[:2]
     apart_m = np.asarray(_GEOD.inv(lon, lat, true_lon, true_lat)[2])
-    if float(np.median(apart_m)) < _COPY_M:
-        return f"is {truth.track.name} under another name, which is the truth"
+    copied = float(np.mean(apart_m < _COPY_M))
+    if copied > _COPIED:
+        when = "under another name" if copied > 0.5 else f"at {copied:.0%} of its fixes, by turns"
+        return f"is {truth.track.name} {when}, which is the truth"
     if one.stated is None:
         return "does not state its accuracy"
     if one.accuracy_m <= truth.accuracy_m:

@@ -84,6 +84,13 @@ def weak(*, eph: float = 6.0, fix_type: int = 3) -> list[tuple]:
     return rows
 
 
+def chosen_by_turns() -> list[tuple]:
+    """A weak receiver that the autopilot chose in the last third of the flight: there it is the truth."""
+    first, second = autopilots.gps_rows(LEVEL), weak()
+    until = 2 * len(first) // 3
+    return [*second[:until], *((*row[:6], 6.0, 3) for row in first[until:])]
+
+
 def off_m(moments_s: np.ndarray) -> np.ndarray:
     """East and north of the second receiver less the first in the CRS, by its own projection."""
     lon, lat = (np.interp(moments_s, LEVEL.time_s, one) for one in (LEVEL.lon_deg, LEVEL.lat_deg))
@@ -130,6 +137,10 @@ def test_a_moment_without_a_fix_has_no_disc(tmp_path: Path) -> None:
         (px4(weak(eph=0.5)), "sensor_gps 1 states 0.5 m, no worse than vehicle_gps_position 0, which is the truth"),
         (px4(weak(eph=float("nan"))), "sensor_gps 1 does not state its accuracy"),
         (px4(weak(fix_type=1)), "sensor_gps 0 is vehicle_gps_position 0 under another name, which is the truth$"),
+        (
+            px4(chosen_by_turns()),
+            r"sensor_gps 1 is vehicle_gps_position 0 at 3[34]% of its fixes, by turns, which",
+        ),
         (px4_drift(1.0, {}), r"a\.ulg has one receiver, vehicle_gps_position 0, which is the truth"),
     ],
 )

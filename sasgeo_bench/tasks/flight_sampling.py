@@ -502,7 +502,7 @@ class FlightDrawer:
             flown = {"distance_m": round(float(distance_m[frame]), 1), "time_s": round(float(time_s[frame]), 2)}
             own = flown | {"is_seen": float(not unseen[frame])}
             if flight.own is not None and mission.takes_log and frame > 0:
-                own[LOGGED] = float(flight.own.is_logged[frame - 1] and (before is None or frame > flight.middle))
+                own[LOGGED] = float(flight.own.is_logged[frame - 1] and (before is None or frame >= flight.middle))
             if start_s is not None:
                 own[UTC] = round(start_s + float(views.time_s[frame]), 3)
             fix = None

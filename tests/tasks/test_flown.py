@@ -279,6 +279,19 @@ def test_steps_in_which_a_receiver_was_fused_are_drawn_and_counted(root, tmp_pat
     )
 
 
+@pytest.mark.slow
+def test_the_step_of_a_carried_drone_is_the_logs_too(root, tmp_path) -> None:
+    """Its odometer says of that step what it says in the control; before it another way is flown, which no log has."""
+    (task,) = make_tasks(
+        request_of(root, "flight-kidnap", flown=Logged(root).write(tmp_path / "a.ulg", has_camera=True))
+    )
+    usual = [step.increment for step, *_ in Logged(root).heard(task, "not carried")]
+    carried = list(Logged(root).heard(task, "F5 odometer unaware"))
+    is_own = [truth.measured["is_logged"] == 1.0 for *_, truth in carried]
+    assert is_own == [step.increment == own for (step, *_), own in zip(carried, usual, strict=True)]
+    assert 0.4 < np.mean(is_own) < 0.6
+
+
 @pytest.mark.parametrize(
     ("odometry", "why"),
     [

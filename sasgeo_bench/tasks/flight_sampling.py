@@ -494,7 +494,7 @@ class FlightDrawer:
             measured["carried_m"] = round(carried_m, 1)
             distance_m = np.where(np.arange(len(views)) < flight.middle, distance_m, distance_m - carried_m)
         unseen, time_s = _unseen(flight, mission), views.time_s - views.time_s[0]
-        gnss = self._gnss(flight, mission, before)
+        gnss = self._gnss(flight, mission)
         start_s = None if self.airspace.flown is None else self.airspace.flown.start_s
         for frame in range(len(views)):
             is_lost = mission.is_lost and frame == flight.middle
@@ -530,21 +530,16 @@ class FlightDrawer:
         both = {item.name: (getattr(step, item.name), getattr(control, item.name)) for item in fields(Odometry)}
         return Odometry(**{name: np.concatenate([own[:into], usual[into:]]) for name, (own, usual) in both.items()})
 
-    def _gnss(self, flight: Flight, mission: Mission, before: Trajectory | None) -> WeakGnss | None:
-        """Return the fixes of priors at the views of a flight, after another first half if it has one."""
+    def _gnss(self, flight: Flight, mission: Mission) -> WeakGnss | None:
+        """Return the fixes of priors at the views of a flight.
+
+        They are off alike where the drone flies another first half: no disc tells which half is the control's.
+        """
         group = mission.group or self.airspace.group
         if not group.is_gnss or group.radius_m is None:
             return None
-        seeds, radius_m = self._seeds(flight.site), group.radius_m
-        drawn = draw_gnss(flight.views.time_s, radius_m=radius_m, rng=seeds.rng("gnss", group.name))
-        here = flight.gnss or drawn
-        if before is None:
-            return here
-        there = draw_gnss(before.time_s, radius_m=radius_m, rng=seeds.rng("gnss", group.name, "carried"))
-        return WeakGnss(
-            off_m=np.concatenate([there.off_m, here.off_m[flight.middle :]]),
-            radius_m=np.concatenate([there.radius_m, here.radius_m[flight.middle :]]),
-        )
+        rng = self._seeds(flight.site).rng("gnss", group.name)
+        return flight.gnss or draw_gnss(flight.views.time_s, radius_m=group.radius_m, rng=rng)
 
     def _seeds(self, site: Site) -> Seeds:
         return self.airspace.seeds_of(site.index)

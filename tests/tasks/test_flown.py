@@ -393,6 +393,19 @@ def test_a_carried_drone_has_a_weak_receiver_on_both_ways(root) -> None:
     assert any("F5" in kind for kind in kinds)
 
 
+@pytest.mark.slow
+def test_no_disc_tells_that_a_drone_was_carried(root, tmp_path) -> None:
+    """The other first half was flown by nobody; the log's receiver is as far off there as on the control's."""
+    flown = Logged(root).write(tmp_path / "a.ulg", second_m=9.0)
+    (task,) = make_tasks(request_of(root, "flight-kidnap", flown=flown, group=PriorGroup.parse("gnss")))
+    found = {}
+    for truth, prior, frame in discs_of(task):
+        found.setdefault(truth.kind, {})[frame] = (prior.radius_m, truth.measured.get("gnss_off_m"))
+    assert {kind for kind in found if "F5" in kind} == {"F5 odometer lost", "F5 odometer unaware"}
+    assert all(of_kind == found["not carried"] for of_kind in found.values())
+    assert {radius_m for radius_m, _ in found["not carried"].values()} == {50.0, 15.0, None}
+
+
 def test_suites_without_flights_have_no_weak_receiver(root) -> None:
     with pytest.raises(ConfigError, match="'clean' has no flights, of which prior group gnss-weak-s3 is: use r50 or"):
         make_tasks(request_of(root, "clean", group=PriorGroup.parse("gnss")))

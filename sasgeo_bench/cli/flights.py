@@ -164,7 +164,7 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
     """
     _check_outputs([options.file], [options.tum] if options.tum else [])
     if options.region is None:
-        for name in ("tum", "least_m", "dem", "takeoff_height", "topic", "odometry", "drift"):
+        for name in ("tum", "least_m", "dem", "takeoff_height", "topic", "odometry", "drift", "prior"):
             if getattr(options, name) not in (None, "log"):
                 raise FlightError(f"--{name.replace('_', '-')} needs --region: it is about the stretch over a region")
         if is_tum(options.file):

@@ -94,7 +94,10 @@ def changed_maps(request: Request, base: Region, flights: Mapping[int, Flight]) 
 def nothing_to_ask(request: Request, suite: Suite, reasons: Counter[str | None]) -> ConfigError:
     """Return an error that gives the most frequent reason why no query can be asked."""
     reason = reasons.most_common(1)[0][0]
-    return ConfigError(f"{request.region.id} is too small or too empty for suite {suite.card.name!r}: {reason}")
+    where = f"{request.region.id} is too small or too empty"
+    if request.flown is not None:
+        where = f"the flight over {request.region.id} leaves nothing to ask"
+    return ConfigError(f"{where} for suite {suite.card.name!r}: {reason}")
 
 
 def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:

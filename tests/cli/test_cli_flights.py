@@ -171,6 +171,7 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
         ),
         (("log.csv", "--least-m", "5"), "--least-m needs --region"),
         (("log.csv", "--tum", "other.txt"), "--tum needs --region"),
+        (("log.csv", "--prior", "gnss"), "--prior needs --region"),
         (("log.csv", "--tum", "."), ". cannot be written (Is a directory): name another place"),
         ((".",), "sasgeo-bench: . is no flight log"),
     ],

@@ -128,6 +128,18 @@ def test_what_cannot_be_asked_is_refused_with_the_reason(root, tmp_path):
     assert not (root / "tasks").exists()
 
 
+def test_a_flight_too_short_for_a_suite_is_told_so_and_not_the_region(root, tmp_path):
+    epsg, way_m = read_manifest(root / "regions" / TOWN).epsg, corners(root)
+    log = log_of(
+        tmp_path / "log.csv", way_m[:2], epsg
+    )  # less than 1.5 km, of which a gap of 500 m is more than a third
+    request = request_of(root, "flight-gap", flown=FlownPath(file=log))
+    with pytest.raises(
+        ConfigError, match=f"the flight over {TOWN} leaves nothing to ask for suite 'flight-gap': a gap is"
+    ):
+        make_tasks(request)
+
+
 def test_a_place_that_no_split_speaks_of_is_all_test(tmp_path):
     own = own_region(tmp_path, name="my-town", source=TOWN)
     (request,) = plan_requests(

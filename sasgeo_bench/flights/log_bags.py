@@ -310,7 +310,7 @@ _NUMBERS: Final = frozenset(
     {
         *("timestamp", "time_utc_usec", "lat", "lon", "alt", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph"),
         *("fix_type", "lat_lon_valid", "x", "y", "z", "xy_valid", "z_valid", "landed", "q", "position"),
-        *("control_mode_flags", *log_ulog.FUSING, "reset_counter", "xy_reset_counter"),
+        *("control_mode_flags", *log_ulog.FUSING, "reset_counter", "xy_reset_counter", "timestamp_sample"),
     }
 )
 

@@ -55,6 +55,7 @@ _ATTITUDE: Final = "vehicle_attitude"
 TOPICS: Final = (*PLACES, _LOCAL, _HOME, _LANDED, _ATTITUDE)
 OF_DRIFT: Final = (*RECEIVERS, _LOCAL, _ATTITUDE, VISUAL, *_FLAGS)
 _E7: Final = 1e7
+_LATEST_S: Final = 1.0  # a message that comes later has no time of its own, or one of another clock
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -243,8 +244,9 @@ def estimates_of(topics: Topics) -> list[Estimate]:
         keys = ["x", "y", "z"] if is_old else [f"position[{at}]" for at in range(3)]
         turns = quaternions_of_ned(*(columns[f"q[{at}]"] for at in range(4)))
         poses = np.column_stack([*(columns[key] for key in keys), turns])
-        stream = Stream.of(topics.source, name, seconds(columns), poses)
-        found.append(Estimate(poses=stream, resets_s=_resets(columns, ("reset_counter",))))
+        time_s = _taken_s(columns)
+        stream = Stream.of(topics.source, name, time_s, poses)
+        found.append(Estimate(poses=stream, resets_s=_resets(time_s, columns, "reset_counter")))
     local = topics.first(_LOCAL)
     if found or local is None:
         return found
@@ -253,12 +255,19 @@ def estimates_of(topics: Topics) -> list[Estimate]:
     is_valid = np.asarray(columns.get("xy_valid", np.ones(len(columns["timestamp"]))), dtype=bool)
     poses = np.column_stack([columns[key] for key in ("x", "y", "z")])
     stream = Stream.of(topics.source, name, seconds(columns)[is_valid], poses[is_valid])
-    resets_s = _resets(columns, ("xy_reset_counter",))
+    resets_s = _resets(seconds(columns), columns, "xy_reset_counter")
     return [Estimate(poses=stream, free_s=free_s, fused=fused, resets_s=resets_s)]
 
 
-def _resets(columns: Columns, names: tuple[str, ...]) -> Floats:
-    return resets_of(seconds(columns), *(columns[name] for name in names if name in columns))
+def _taken_s(columns: Columns) -> Floats:
+    """Return when a camera saw what a message says, which comes later, as PX4's own estimator takes it; seconds."""
+    time_s = seconds(columns)
+    taken_s = np.asarray(columns.get("timestamp_sample", columns["timestamp"]), dtype=np.float64) / 1e6
+    return np.where((taken_s <= time_s) & (time_s - taken_s < _LATEST_S), taken_s, time_s)
+
+
+def _resets(time_s: Floats, columns: Columns, name: str) -> Floats:
+    return resets_of(time_s, *([columns[name]] if name in columns else []))
 
 
 def read_odometry(path: Path) -> LoggedOdometry:

@@ -84,6 +84,24 @@ def test_steps_are_those_of_the_camera_in_its_own_metres_and_by_its_own_heading(
     assert LEVEL.yaw_deg[[15, 46]].tolist() == [357.5, 13.0]  # the flight turns over north on the first step
 
 
+def test_a_pose_of_a_camera_is_of_when_it_was_seen_and_not_of_when_it_came(tmp_path: Path) -> None:
+    """Messages come up to 0.8 s late, and one in ten does not say when it was seen."""
+    log = camera(reset_s=45.0)
+    fields, rows = log["vehicle_visual_odometry", 0]
+    late_us = np.random.default_rng(0).integers(0, 800_000, len(rows)).tolist()
+    late = [
+        (us + late_by, us, *rest) if at % 10 else (us, 0, *rest)
+        for at, ((us, *rest), late_by) in enumerate(zip(rows, late_us, strict=True))
+    ]
+    fields = fields.replace("timestamp;", "timestamp;uint64_t timestamp_sample;")
+    log["vehicle_visual_odometry", 0] = (fields, sorted(late))
+    steps = steps_of(write(tmp_path / "a.ulg", ulog(log)))
+    usual = steps_of(write(tmp_path / "b.ulg", ulog(camera(reset_s=45.0))))
+    assert steps.is_lost.tolist() == usual.is_lost.tolist() == [False, False, False, True, False]
+    for name in ("right_m", "up_m", "yaw_deg"):
+        np.testing.assert_allclose(getattr(steps, name), getattr(usual, name), atol=1e-6)
+
+
 def test_steps_of_an_estimator_are_the_logs_only_where_no_receiver_was_fused(tmp_path: Path) -> None:
     log = px4_drift(1.05, {("estimator_status", 0): fusing(lambda time_s: not 9 <= time_s <= 50)})
     steps = steps_of(write(tmp_path / "a.ulg", ulog(log)))

@@ -173,19 +173,25 @@ def test_each_column_of_dataflash_is_what_mavlogdump_prints(tmp_path: Path, name
 
 
 def _telemetry() -> bytes:
-    """Telemetry with poses of a companion, in both messages that carry them."""
+    """Telemetry with a second receiver, and with poses of a companion in both messages that carry them."""
     from pymavlink.dialects.v20 import common  # type: ignore[import-untyped] # noqa: PLC0415 - only where installed
 
     link = common.MAVLink(None, srcSystem=1, srcComponent=197)
+    autopilot = common.MAVLink(None, srcSystem=1, srcComponent=1)
     nan, packets = [float("nan")] * 21, tlog(FLOWN, late_s=0)
     for at, us in enumerate(stamps_us(FLOWN.time_s)):
         place, more = (1.5 * at, -0.5 * at, -80.25), (*[0.0] * 6, nan, nan, 0, 3, 0)
-        for one in (
-            common.MAVLink_odometry_message(us, 20, 12, *place, list(turn(at)), *more),
-            common.MAVLink_vision_position_estimate_message(us, *place, 0.125, -0.25, 0.01 * at),
+        lat, lon = 471_400_000 + 7 * at, 95_200_000 - 3 * at
+        receiver = common.MAVLink_gps2_raw_message(
+            us, 3, lat, lon, 560_000, 80, 90, 800, 4500, 9, 0, 0, h_acc=4000 + at
+        )
+        for sender, one in (
+            (autopilot, receiver),
+            (link, common.MAVLink_odometry_message(us, 20, 12, *place, list(turn(at)), *more)),
+            (link, common.MAVLink_vision_position_estimate_message(us, *place, 0.125, -0.25, 0.01 * at)),
         ):
             received_us = autopilots.START_S * 1_000_000 + round(float(FLOWN.time_s[at]) * 1e6)
-            packets += received_us.to_bytes(8, "big") + bytes(one.pack(link))
+            packets += received_us.to_bytes(8, "big") + bytes(one.pack(sender))
     return packets
 
 

@@ -36,6 +36,7 @@ from sasgeo_bench.flights.log_streams import (
     library,
     quaternions_of_angles,
     resets_of,
+    seen_at,
     stated_of,
 )
 from sasgeo_bench.flights.log_units import LEAST_FIX
@@ -194,7 +195,7 @@ def _of_text(
 FIELDS: Final = frozenset(
     {
         *("TimeUS", "TimeMS", "T", "I", "C", "Status", "GMS", "GWk", "Week", "Lat", "Lng", "Alt", "HAcc", "RelHomeAlt"),
-        *("Yaw", "Pitch", "Roll", "PN", "PE", "PD", "SS", "PI", "PX", "PY", "PZ", "R", "P", "Y", "Rst"),
+        *("Yaw", "Pitch", "Roll", "PN", "PE", "PD", "SS", "PI", "PX", "PY", "PZ", "R", "P", "Y", "Rst", "CTimeMS"),
         *(f"{what}D{axis}" for what in ("Ang", "Pos") for axis in "XYZ"),
     }
 )
@@ -265,8 +266,9 @@ def estimates_of(messages: Messages) -> list[Estimate]:
     if (columns := messages.messages.get("VISP")) is not None:
         turns = quaternions_of_angles(columns["Y"], columns["P"], columns["R"])
         poses = np.column_stack([*(columns[key] for key in ("PX", "PY", "PZ")), turns])
-        resets_s = resets_of(seconds(columns), columns["Rst"]) if "Rst" in columns else np.empty(0)
-        return [Estimate(poses=Stream.of(source, "VISP", seconds(columns), poses), resets_s=resets_s)]
+        time_s = seen_at(seconds(columns), columns["CTimeMS"] / 1e3)
+        resets_s = resets_of(time_s, columns["Rst"]) if "Rst" in columns else np.empty(0)
+        return [Estimate(poses=Stream.of(source, "VISP", time_s, poses), resets_s=resets_s)]
     if (columns := messages.messages.get("VISO")) is not None:
         return [Estimate(poses=Stream.of(source, "VISO", seconds(columns), _summed(columns)))]
     for poses_of, flags_of in (("XKF1", "XKF4"), ("NKF1", "NKF4")):

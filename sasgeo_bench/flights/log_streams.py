@@ -26,6 +26,7 @@ Bools = NDArray[np.bool_]
 
 MOST_LOG_BYTES: Final = 2 * 2**30  # its readers keep no more than the streams they need
 
+_LATEST_S: Final = 1.0  # of a message that says when its pose was seen
 _MOST_APART_S: Final = 1.0  # from a fix to a height or an attitude that is its own
 _BEYOND_S: Final = 0.1  # two clocks of one computer agree so well
 _JUMP_S: Final = 1.0  # of a clock; what is written late is less out of order
@@ -329,6 +330,17 @@ def resets_of(time_s: Floats, *counters: Floats) -> Floats:
     """
     changed = [np.append(False, np.diff(np.asarray(one, dtype=np.float64)) != 0) for one in counters]
     return time_s[np.logical_or.reduce(changed)] if changed else np.empty(0)
+
+
+def seen_at(came_s: Floats, seen_s: Floats) -> Floats:
+    """Return when a camera saw what messages say, shape (N,), by what they say of it and by when they came, seconds.
+
+    Autopilots bring the first onto their own clock, and take it. Where it is later or a second off, it is of another.
+
+    >>> seen_at(np.array([10.0, 11.0, 12.0]), np.array([9.8, 0.0, 1.7e9])).tolist()
+    [9.8, 11.0, 12.0]
+    """
+    return np.where((seen_s <= came_s) & (came_s - seen_s < _LATEST_S), seen_s, came_s)
 
 
 def quaternions_of_ned(w: Floats, x: Floats, y: Floats, z: Floats) -> Floats:

@@ -33,6 +33,7 @@ from sasgeo_bench.flights.log_streams import (
     library,
     quaternions_of_ned,
     resets_of,
+    seen_at,
     stated_of,
 )
 from sasgeo_bench.flights.log_units import LEAST_FIX
@@ -55,7 +56,6 @@ _ATTITUDE: Final = "vehicle_attitude"
 TOPICS: Final = (*PLACES, _LOCAL, _HOME, _LANDED, _ATTITUDE)
 OF_DRIFT: Final = (*RECEIVERS, _LOCAL, _ATTITUDE, VISUAL, *_FLAGS)
 _E7: Final = 1e7
-_LATEST_S: Final = 1.0  # a message that comes later has no time of its own, or one of another clock
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -244,7 +244,9 @@ def estimates_of(topics: Topics) -> list[Estimate]:
         keys = ["x", "y", "z"] if is_old else [f"position[{at}]" for at in range(3)]
         turns = quaternions_of_ned(*(columns[f"q[{at}]"] for at in range(4)))
         poses = np.column_stack([*(columns[key] for key in keys), turns])
-        time_s = _taken_s(columns)
+        time_s = seconds(columns)
+        if "timestamp_sample" in columns:
+            time_s = seen_at(time_s, np.asarray(columns["timestamp_sample"], dtype=np.float64) / 1e6)
         stream = Stream.of(topics.source, name, time_s, poses)
         found.append(Estimate(poses=stream, resets_s=_resets(time_s, columns, "reset_counter")))
     local = topics.first(_LOCAL)
@@ -257,13 +259,6 @@ def estimates_of(topics: Topics) -> list[Estimate]:
     stream = Stream.of(topics.source, name, seconds(columns)[is_valid], poses[is_valid])
     resets_s = _resets(seconds(columns), columns, "xy_reset_counter")
     return [Estimate(poses=stream, free_s=free_s, fused=fused, resets_s=resets_s)]
-
-
-def _taken_s(columns: Columns) -> Floats:
-    """Return when a camera saw what a message says, which comes later, as PX4's own estimator takes it; seconds."""
-    time_s = seconds(columns)
-    taken_s = np.asarray(columns.get("timestamp_sample", columns["timestamp"]), dtype=np.float64) / 1e6
-    return np.where((taken_s <= time_s) & (time_s - taken_s < _LATEST_S), taken_s, time_s)
 
 
 def _resets(time_s: Floats, columns: Columns, name: str) -> Floats:

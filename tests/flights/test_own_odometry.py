@@ -213,7 +213,8 @@ def test_poses_of_other_autopilots_and_of_a_named_topic_are_read_alike(tmp_path:
     for at, us in enumerate(stamps_us(LEVEL.time_s)):
         north, east = (1.04 * north_east_m()[at]).tolist()
         tail = (0.1, 0.1, 0.1, int(LEVEL.time_s[at] > 43), 90)
-        rows["VISP"].append((us, us, us // 1000, north, east, 0.0, 0.0, 0.0, float(LEVEL.yaw_deg[at]), *tail))
+        late_us = (us + 150_000 * (at % 5), us)  # the first is when the message came
+        rows["VISP"].append((*late_us, us // 1000, north, east, 0.0, 0.0, 0.0, float(LEVEL.yaw_deg[at]), *tail))
     moved, turns_deg = true_steps(MOMENTS_S)
     steps = steps_of(write(tmp_path / "a.bin", dataflash(rows)))
     assert steps.is_lost.tolist() == [False, False, False, True, False]

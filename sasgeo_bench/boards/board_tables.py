@@ -930,18 +930,19 @@ def requirement_tables(requirements: pd.DataFrame, book: Book) -> Iterator[Table
 
 
 def _requirement_cell(row: Record | None) -> Cell:
-    """Return a verdict, with the figure, its interval and the share that was accepted where only these count."""
+    """Return a verdict, with the figure, its interval and the share that was accepted, or confirmed, if these count."""
     if row is None:
         return Cell(text="-")
     value, lo, hi, accepted = (float(row[name]) for name in ("figure", "figure_lo", "figure_hi", "accepted"))
+    done = "confirmed" if "confirmed" in str(row["metric"]) else "accepted"
     if accepted == 0:
-        details = ["nothing accepted"]
+        details = [f"nothing {done}"]
     elif math.isnan(value):
         details = ["no threshold" if row["metric"] in _RISK_REACHED else "not measured"]
     else:
         details = [_amount_text(value, lo, hi, unit=str(row["unit"]))]
         details += ["in time"] if is_latency(str(row["metric"])) else []
-        details += [] if math.isnan(accepted) else [f"of {100 * accepted:.3g} % accepted"]
+        details += [] if math.isnan(accepted) else [f"of {100 * accepted:.3g} % {done}"]
     verdict = str(row["verdict"])
     return Cell(text=verdict, key=sort_key(value), tone=_TONE_OF[verdict], details=tuple(details))
 

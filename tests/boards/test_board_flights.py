@@ -139,7 +139,7 @@ def test_stored_results_give_the_same_board(out):
 
 ASKED = {
     "within": ["5m,1deg"],
-    "require": ["80% within 50 m, p95 latency 400 ms", "false <= 1%, available_30s >= 30%"],
+    "require": ["80% within 50 m, p95 latency 400 ms", "false <= 1%, available_30s >= 30%, false_of_confirmed <= 1%"],
 }
 
 
@@ -171,6 +171,10 @@ def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results
     assert "Share of the flown distance with an estimate within 5m and 1deg" in page.read_text(encoding="utf-8")
     text = (board.folder / "leaderboard.md").read_text(encoding="utf-8")
     assert "| matcher | all | 80% within 50 m |" in text
+    (shares,) = (line.split("|") for line in text.splitlines() if line.startswith("| far ") and "accepted" in line)
+    confirmed = board.requirements.set_index(["requirement", "matcher"])["accepted"]["false_of_confirmed <= 1%", "far"]
+    assert sum(f"of {100 * confirmed:.3g} % confirmed" in cell for cell in shares) == 1
+    assert sum(" % accepted" in cell for cell in shares) == 1
     assert "## Fixes in use: flight-overconfident" in text
 
 

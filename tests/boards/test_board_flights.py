@@ -290,13 +290,17 @@ def test_the_receiver_is_checked_by_the_fixes_of_a_run(out, program, mistake):
     code, printed, err = program("check-gnss", str(out / "runs" / "near"), "--out", str(out), "--pull-off", "2,20")
     assert code == 0, err
     rows = [line.split() for line in printed.splitlines()[1:] if line.strip()]
-    assert [row[:3] for row in rows] == [[SUITE, REGION, "6"]] * 2
-    assert [row[5] for row in rows] == ["0.00"] * 2  # false alarms: its fixes are 3 m off
-    assert float(rows[0][6]) == pytest.approx(2.996 / float(rows[0][3]), rel=0.05)  # the rule of three
-    assert rows[1][8] == "100%"
+    assert [row[:4] for row in rows] == [[SUITE, REGION, "6", "2"]] * 2
+    scores = read_scores(out / "boards" / "mine")
+    hours = scores.groupby("pair_id")["duration_s"].first().sum() / 3600
+    assert float(rows[0][4]) == pytest.approx(hours, rel=0.05)  # three flights along one path are one
+    assert "one path count as one" in err
+    assert [row[6] for row in rows] == ["0.00"] * 2  # false alarms: its fixes are 3 m off
+    assert float(rows[0][7]) == pytest.approx(2.996 / hours, rel=0.01)  # the rule of three
+    assert rows[1][9] == "100%"
     # fixes that are accepted 40 m off alarm every flight
     printed = program("check-gnss", str(out / "runs" / "far"), "--out", str(out))[1]
-    assert float(printed.splitlines()[1].split()[5]) > 0
+    assert float(printed.splitlines()[1].split()[6]) > 0
     assert "--pull-off must be positive metres a second" in mistake(
         "check-gnss", out / "runs" / "near", "--pull-off", "0"
     )

@@ -368,6 +368,9 @@ class TaskWriter:
             if seen is not None:
                 count += 1
                 yield self._pair(one, suite, _Asked(own.digest("query").hex()[:24], prior, own), seen)
+        # the most frequent reason first, with names in order: pictures were read in the order of their ids
+        by_count = sorted(self.failed_by.items(), key=lambda item: (-len(item[1]), item[0]))
+        self.failed_by = {why: sorted(names) for why, names in by_count}
         if not count:
             self.tell_failed()
             raise _nothing(self.request.pictures, self.failed_by)

@@ -3,6 +3,7 @@
 
 import datetime as dt
 import math
+import re
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -186,12 +187,15 @@ def pose_pictures(
 
 
 def reason_of(error: SasgeoError, path: Path) -> str:
-    """Return the text of an error without the path or name of its picture, so that like faults are counted together.
+    """Return the text of an error without the name of its picture or mask, so that like faults are counted together.
 
-    >>> reason_of(ImageError("photos/a.jpg is no JPEG"), Path("photos/a.jpg"))
+    >>> reason_of(ImageError("photos/1.jpg is no JPEG"), Path("photos/1.jpg"))
     'it is no JPEG'
+    >>> reason_of(ImageError("most of what 1.png holds is 1.5"), Path("photos/1.jpg"))
+    'most of what it holds is 1.5'
     """
-    return plain(str(error)).replace(plain(str(path)), "it").replace(plain(path.name), "it")[:160]
+    text = plain(str(error)).replace(plain(str(path)), "it").replace(plain(path.name), "it")
+    return re.sub(rf"(?<!\w){re.escape(plain(path.stem))}\.[A-Za-z]\w*", "it", text)[:160]
 
 
 def is_georeferenced(path: Path) -> bool:

@@ -20,7 +20,7 @@ from sasgeo_bench.core.texts import plain
 from sasgeo_bench.observing.fixes import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
-from sasgeo_bench.observing.results import PAGE, Strips, write_results
+from sasgeo_bench.observing.results import PAGE, TABLE, Strips, write_results
 from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 from sasgeo_bench.sensing.video import EVERY_S, is_video
 
@@ -111,8 +111,8 @@ def locate(options: LocateOptions) -> Located:
     """Find out where pictures were taken, and how far to trust it; a page shows what was seen and where it fits.
 
     The position in a file is the middle of nothing: it lies anywhere in the disc that is searched, so that it can be
-    no answer. A second call goes on where the first was cut off. A video is located by frames of it, which get places,
-    heights and angles of its track.
+    no answer. A second call goes on where the first was cut off; if every picture fails, results of an earlier call
+    stay. A video is located by frames of it, which get places, heights and angles of its track.
 
     Returns
     -------
@@ -174,7 +174,10 @@ def locate(options: LocateOptions) -> Located:
     answered = [found.calibration] if any(fix.p_false is not None for fix in found.fixes) else []
     for note in (*answered, *notes_of(found.fixes)):
         tell(note)
-    write_results(found)
+    if all(fix.status == "failed" for fix in found.fixes) and (into / TABLE).is_file():
+        tell(f"no picture could be asked: {into} keeps the results of an earlier call")
+    else:
+        write_results(found)
     return found
 
 
@@ -215,7 +218,7 @@ def locate_command(options: LocateOptions) -> None:
     say(found.request.into / PAGE)
     failed = sum(fix.status == "failed" for fix in found.fixes)
     if failed:
-        complain(f"{failed} of {len(found.fixes)} pictures could not be asked; their rows say why")
+        complain(f"{failed} of {len(found.fixes)} pictures could not be asked; their lines say why")
         raise typer.Exit(CONTESTANT_FAILED)
 
 

@@ -141,6 +141,19 @@ def test_one_picture_that_is_none_costs_its_own_row(located):
     assert (rows[0]["is_accepted"], rows[1]["is_accepted"]) == ("true", "false")
 
 
+def test_where_every_picture_fails_results_of_an_earlier_call_stay(located, towns, tmp_path):
+    into, _ = located
+    before = {name: (into / name).read_bytes() for name in ("locate.csv", "index.html")}
+    (tmp_path / "b.jpg").write_text("no picture")
+    lines = []
+    words = {"ground_width": 100.0, "region": TOWN, "trusted": True, "tell": lines.append}
+    sgb.locate(tmp_path, out=towns, into=into, **words)
+    assert {name: (into / name).read_bytes() for name in before} == before
+    assert f"no picture could be asked: {into} keeps the results of an earlier call" in lines
+    sgb.locate(tmp_path, out=towns, into=tmp_path / "into", **words)  # with none, the table says what is wrong
+    assert "no JPEG, TIFF or DNG" in (tmp_path / "into" / "locate.csv").read_text()
+
+
 def test_the_page_shows_every_picture_and_what_the_chances_stand_on(located):
     into, _ = located
     page = (into / "index.html").read_text()

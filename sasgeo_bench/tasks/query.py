@@ -348,3 +348,8 @@ class Truth:
     measured: dict[str, float] = field(default_factory=dict)
     detector: Detector = PUBLISHED
     labels: tuple[FrameLabels, ...] = field(default=(), repr=False, compare=False)
+
+    @property
+    def is_own(self) -> bool:
+        """Return whether it is of a user's own picture, whose pose is as good as its file says."""
+        return self.strength_unit == TRUTH_SIGMA

@@ -17,7 +17,7 @@ from sasgeo_bench.boards.board_files import read_leaderboard, read_scores
 from sasgeo_bench.boards.board_pictures import FLIGHT_BYTES
 from sasgeo_bench.boards.flight_page import ellipse_of, flight_page
 from sasgeo_bench.boards.publish import publish
-from sasgeo_bench.cli.boards import score
+from sasgeo_bench.cli.boards import score, show_board
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import RunManifest
@@ -144,7 +144,7 @@ ASKED = {
 
 
 @pytest.mark.usefixtures("plain_site")
-def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results_scored_again(out, tmp_path):
+def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results_scored_again(out, tmp_path, capsys):
     results = tmp_path / "results"
     board = score(predictions=out / "runs", out=out, name="asked", draws=100, cases=False, results=results, **ASKED)
     mine = board.leaderboard[board.leaderboard["metric"] == "distance_within_5m_1deg"]
@@ -172,6 +172,13 @@ def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results
     text = (board.folder / "leaderboard.md").read_text(encoding="utf-8")
     assert "| matcher | all | 80% within 50 m |" in text
     assert "## Fixes in use: flight-overconfident" in text
+    head = next(line for line in text.splitlines() if line.startswith("| matcher | distance_within_25m"))
+    assert {"distance_within_5m_1deg", "distance_within_50m", "available_30s"} <= set(head.split(" | "))
+    capsys.readouterr()
+    show_board(board)
+    head = next(line for line in capsys.readouterr().out.splitlines() if SUITE in line and "matcher" in line)
+    assert f"{SUITE}: distance_within_5m_1deg" in head
+    assert f"{SUITE}: distance_within_50m" in head
 
 
 @pytest.mark.parametrize(

@@ -80,7 +80,7 @@ def flight_page(task: Task, flight: str, tracker: str, views: pd.DataFrame, answ
             title=f"{tracker} on {task.manifest.suite} over {task.manifest.region}",
             tracker=tracker,
             flight=flight,
-            kind=f"{panel.truth.role}: {panel.truth.kind}",
+            kind=panel.truth.title,
             what=task.manifest.what,
             left_out=step > 1 and f"One of {step} of the {len(mine)} views is shown.",
             credit=task.manifest.provenance.credit,

@@ -166,7 +166,7 @@ def flight_map_pixels(task: Task, flight: str, views: Mapping[str, pd.DataFrame]
     across = min(_ACROSS, len(names))
     sheet = Page(
         title=f"{about.title}: {about.region}",
-        facts=f"One flight, {truth.role}: {truth.kind}. {about.what}",
+        facts=f"One flight, {truth.title}. {about.what}",
         note="North is up." + (" Trackers differ most on this flight of the suite." if len(names) > 1 else ""),
         data=about.provenance.credit,
         rows=-(-len(names) // across),

@@ -27,7 +27,7 @@ from sasgeo_bench.boards.cases import (
 from sasgeo_bench.boards.run_cases import RunCases, picture_of
 from sasgeo_bench.core.canvas import GREY, Page, new_figure, styled, without_ticks
 from sasgeo_bench.core.errors import ConfigError, counted
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.scoring.strata import STRESS
@@ -175,15 +175,6 @@ def _keys(rows: Sequence[CasePicture]) -> list[Artist]:
     return [*keys, *evidence_keys(shown)]
 
 
-def _known(view: Evidence) -> Evidence:
-    """Return the evidence of the classes of which anything is known: those the segmenter never learned say nothing."""
-    kept = (view.cells != UNKNOWN).any(axis=(1, 2))
-    if not kept.any():
-        return view
-    classes = tuple(name for name, is_known in zip(view.classes, kept, strict=True) if is_known)
-    return Evidence(classes=classes, cells=view.cells[kept], cell_size_m=view.cell_size_m)
-
-
 def _draw_row(line: Sequence[Axes], case: CasePicture, *, is_first: bool) -> None:
     """Draw a query; the first row names the columns."""
     if case.picture is not None:
@@ -195,7 +186,7 @@ def _draw_row(line: Sequence[Axes], case: CasePicture, *, is_first: bool) -> Non
         line[1].text(
             0.5, 0.5, "not stored: segment again", ha="center", va="center", color=GREY, transform=line[1].transAxes
         )
-    draw_panel(line[2], "", _known(case.view))
+    draw_panel(line[2], "", case.view.of_known_classes())
     draw_panel(line[3], "", case.at_answer)
     draw_map(line[4], case)
     across_m = max(case.part.east_m - case.part.west_m, case.part.north_m - case.part.south_m)

@@ -446,7 +446,7 @@ class TaskWriter:
             kind="own picture",
             strength=next((step for step in _STEPS_M if step >= one.sigma_m), one.sigma_m),
             strength_unit=TRUTH_SIGMA,
-            unknown_share=seen.evidence.unknown_share,
+            unknown_share=seen.evidence.of_known_classes().unknown_share,  # what no one looks for is not hidden
             changed_share=0.0,
             feature_density=density,
             alias_index=None,

@@ -87,6 +87,8 @@ def checked(task: Task, values: np.ndarray, pose: sgb.Pose, *, off_m: float) -> 
         assert (seen == expected)[is_known].mean() > 0.98, name  # cells on an edge may go either way
     known = {name for name in view.classes if (view.layer(name) != sgb.UNKNOWN).any()}
     assert known == set(CODES)
+    hidden = np.mean([(view.layer(name) == sgb.UNKNOWN).mean() for name in CODES])  # other classes hide nothing
+    assert truth.unknown_share == pytest.approx(hidden)
     return query
 
 

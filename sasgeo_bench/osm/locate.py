@@ -12,7 +12,6 @@ from threading import Event, Thread
 from typing import Annotated, Final, Literal, Self
 from urllib.parse import urlsplit
 
-import pyproj
 from pydantic import (
     AfterValidator,
     Field,
@@ -127,6 +126,8 @@ class ClassTable(Document):
     @field_validator("epsg")
     @classmethod
     def _epsg_is_known(cls, epsg: int | None) -> int | None:
+        import pyproj  # noqa: PLC0415 - a process of a matcher reads no map of one's own, and starts without it
+
         try:
             return epsg if epsg is None or pyproj.CRS.from_epsg(epsg) else None
         except pyproj.exceptions.CRSError as error:

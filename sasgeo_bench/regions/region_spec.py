@@ -471,14 +471,13 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     >>> find_region_file("vadus")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
+    sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions or new-region)
     """
-    own = OWN_FOLDER / f"{id_or_path}.toml"
 
     def known() -> dict[str, Path]:
-        return ({id_or_path: own} if own.is_file() else {}) | list_region_files(folders=folders)
+        return {path.stem: path for path in sorted(OWN_FOLDER.glob("*.toml"))} | list_region_files(folders=folders)
 
-    return find_document(id_or_path, "region", "list regions shows all", known)
+    return find_document(id_or_path, "region", "list regions or new-region", known)
 
 
 def region_text(

@@ -112,6 +112,13 @@ def test_help_names_every_command_and_reads_the_code_of_none():
         assert set(commands) <= set(ended.stdout.split())
 
 
+def test_the_name_of_the_program_alone_and_h_print_the_help(program):
+    code, alone, err = program()
+    assert (code, err) == (0, "")
+    assert alone == program("-h")[1] == program("--help")[1]
+    assert program("verify", "-h")[1] == program("verify", "--help")[1]
+
+
 @pytest.mark.parametrize(("name", "file"), [one for group in COMMANDS.values() for one in group.items()])
 def test_every_command_can_be_read_and_has_the_help_that_the_program_shows(program, name, file):
     code, shown, err = program(name, "--help")

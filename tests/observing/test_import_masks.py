@@ -235,6 +235,22 @@ def test_masks_with_one_fault_are_one_line_with_their_names_in_order(own_out, re
     assert 'it holds is not in the legend, such as 0: if that is the background, say 0 = "none"' in line
 
 
+def test_masks_of_another_legend_are_one_line_however_many(own_out, region, pose, values, legend, tmp_path):
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    photos.mkdir()
+    masks.mkdir()
+    for name in ("a", "b", "c"):
+        photo_at(photos / f"{name}.jpg", region, pose)
+        Image.fromarray(values * 60 + 5, mode="L").save(masks / f"{name}.png")
+    with pytest.raises(
+        ConfigError, match=r"3 pictures \(a\.jpg, b\.jpg, c\.jpg\) .*most of what it holds is not in the"
+    ):
+        sgb.import_masks(masks, photos=photos, legend=legend, region=TOWN, out=own_out)
+    (tmp_path / "masks.zip").write_bytes(b"PK")
+    with pytest.raises(ConfigError, match=r"masks\.zip is an archive: unpack it and name the folder"):
+        sgb.import_masks(tmp_path / "masks.zip", photos=photos, legend=legend, region=TOWN, out=own_out)
+
+
 def test_pixels_that_are_not_square_ask_for_a_warp(own_out, values, legend, tmp_path):
     folder = tmp_path / "masks"
     folder.mkdir()

@@ -22,7 +22,7 @@ from sasgeo_bench.scoring.flights import SHARE_INSIDE
 from sasgeo_bench.scoring.relative_pose import relative_errors
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.tasks.sheet import Ground, bounds_of_m, flight_panels
+from sasgeo_bench.tasks.sheet import Ground, bounds_of_m, flight_panels, flight_title
 from sasgeo_bench.tasks.task_files import Task
 
 Pixels = NDArray[np.uint8]
@@ -80,7 +80,7 @@ def flight_page(task: Task, flight: str, tracker: str, views: pd.DataFrame, answ
             title=f"{tracker} on {task.manifest.suite} over {task.manifest.region}",
             tracker=tracker,
             flight=flight,
-            kind=panel.truth.title,
+            kind=flight_title(panel.truth),
             what=task.manifest.what,
             left_out=step > 1 and f"One of {step} of the {len(mine)} views is shown.",
             credit=task.manifest.provenance.credit,

@@ -41,7 +41,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.scoring.flights import DRIFT_M, RECKONED_M
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import CONTROL, DRIFT, GROUP, primary_rows
-from sasgeo_bench.tasks.sheet import TRUE, Ground, bounds_of_m, draw_flight, flight_keys, flight_panels
+from sasgeo_bench.tasks.sheet import TRUE, Ground, bounds_of_m, draw_flight, flight_keys, flight_panels, flight_title
 from sasgeo_bench.tasks.task_files import Task
 
 MOST_TRACKERS: Final = 6
@@ -166,7 +166,7 @@ def flight_map_pixels(task: Task, flight: str, views: Mapping[str, pd.DataFrame]
     across = min(_ACROSS, len(names))
     sheet = Page(
         title=f"{about.title}: {about.region}",
-        facts=f"One flight, {truth.title}. {about.what}",
+        facts=f"One flight, {flight_title(truth)}. {about.what}",
         note="North is up." + (" Trackers differ most on this flight of the suite." if len(names) > 1 else ""),
         data=about.provenance.credit,
         rows=-(-len(names) // across),

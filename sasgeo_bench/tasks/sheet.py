@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contact sheets: the views of queries, the map at the true place, the difference, and the map at a twin or decoy."""
 
+import datetime as dt
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.canvas import Page, PlainFigure, page, panels, without_ticks
 from sasgeo_bench.core.errors import ConfigError, StoreError, counted
+from sasgeo_bench.flights.drift_profile import list_profiles, load_profile
 from sasgeo_bench.geometry.pose import Pose, reckon
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
@@ -31,6 +33,7 @@ from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import GROUND, HIDDEN, paint_evidence, paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
 from sasgeo_bench.tasks.build import rebuild_hint
+from sasgeo_bench.tasks.flight_sampling import UTC
 from sasgeo_bench.tasks.query import (
     PUBLISHED,
     TRUTH_SIGMA,
@@ -96,7 +99,7 @@ def is_one_of_several(seen: Evidence) -> NDArray[np.bool_]:
     if seen.confidence is None:
         return np.zeros(seen.cells.shape, dtype=bool)
     found = (seen.cells == PRESENT) & (seen.confidence <= _EVEN)
-    return found & (found.sum(axis=0) > 1)
+    return np.asarray(found & (found.sum(axis=0) > 1), dtype=bool)
 
 
 def settled(seen: Evidence, mapped: Evidence) -> Evidence:
@@ -224,6 +227,19 @@ def strength_text(truth: Truth) -> str:
     return f"map {age_years:.1f} years old (step {truth.strength:g})"
 
 
+def flight_title(truth: Truth) -> str:
+    """Return what a flight is, with the odometer that drifts on it where its kind names one by its profile.
+
+    >>> from types import SimpleNamespace
+    >>> flight_title(SimpleNamespace(title="stress: F1 vio-stereo"))
+    'stress: F1 vio-stereo (its odometer: Visual-inertial odometry, stereo)'
+    """
+    profile = truth.title.rpartition(" ")[2]
+    if profile not in list_profiles():
+        return truth.title
+    return f"{truth.title} (its odometer: {load_profile(profile).title})"
+
+
 def rival_text(truth: Truth) -> str:
     """Return how far the twin of a place is and what a plain search lists; empty without a twin.
 
@@ -254,11 +270,18 @@ def _known_text(query: Query) -> str:
     return f"{PriorGroup.parse(query.prior_group).words}; {len(query.candidates)} candidates{vectors}"
 
 
+def _value(name: str, value: float) -> str:
+    if name == UTC:
+        return f"{dt.datetime.fromtimestamp(value, tz=dt.UTC):%Y-%m-%d %H:%M:%S}"
+    return f"{value:.3g}"
+
+
 def _text(panel: Panel) -> tuple[str, ...]:
     query, truth = panel.query, panel.truth
     rows, cols = query.evidence.shape
     alias = "" if truth.alias_index is None else f", alias {truth.alias_index:.2f}"
-    measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items() if name not in _OF_TWIN)
+    shown = {name: value for name, value in truth.measured.items() if name not in _OF_TWIN}
+    measured = ", ".join(f"{name} {_value(name, value)}" for name, value in shown.items())
     return (
         truth.title + (f", detector {truth.detector}" if truth.detector != PUBLISHED else ""),
         strength_text(truth),

@@ -119,6 +119,12 @@ def test_an_own_picture_is_no_control_and_classes_that_nobody_looks_for_hide_not
     np.testing.assert_allclose(picture[0, 1], to_rgb(GROUND))
 
 
+def test_a_moment_is_shown_as_a_date():
+    drawn = sheet_figure("mine", [panel(measured={"utc_s": 1718353855.75, "height_m": 120.4})])
+    texts = " ".join(text.get_text() for text in drawn.texts).replace("\n", " ")
+    assert "utc_s 2024-06-14 08:30:55, height_m 120" in texts
+
+
 @pytest.mark.parametrize("rows", [1, 3])
 @pytest.mark.parametrize("has_vectors", [False, True])
 def test_a_sheet_has_a_row_for_each_query_and_a_column_more_for_vectors(rows, has_vectors):

@@ -2,6 +2,7 @@
 """Tasks on disk: `queries.parquet` and `task.json` for everyone, `truth.parquet` for the scorer alone."""
 
 import datetime as dt
+import difflib
 import hashlib
 import json
 from collections import Counter
@@ -409,6 +410,7 @@ TRUTH_OF: Final = "truth.json"
 PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and bits, where the seed is private
 SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
+_MAKE: Final = "make the queries first (make-queries, import-flight; of your own pictures import-photos, import-masks)"
 _ROWS: Final = 128  # of a row group, which is in memory at once
 
 
@@ -825,12 +827,29 @@ def read_task(folder: str | Path) -> dict[str, JsonValue]:
     return Task.open(folder).manifest.to_json()
 
 
+def _no_task(folder: Path, named: str | Path) -> str:
+    """Return what is wrong with a folder that is no task, and the task that was meant, if one is near."""
+    if folder.is_dir():
+        inside = next(iter(sorted(folder.glob(f"*/{TASK}"))), None)
+        mend = f"{_MAKE}" if inside is None else f"name a task in it, as {inside.parent}, or all by a *"
+        return f"{named} holds no {TASK}: {mend}"
+    above = next(parent for parent in folder.parents if parent.is_dir())
+    tasks = {
+        "/".join(path.parts[-3:-1]): path.parent
+        for root in (above, Path("out", "tasks"))
+        for depth in ("*", "*/*")
+        for path in sorted(root.glob(f"{depth}/{TASK}"))
+    }
+    near = difflib.get_close_matches("/".join(folder.parts[-2:]), tasks, n=1, cutoff=0.8)
+    return f"there is no folder {named}: " + (
+        f"did you mean {tasks[near[0]]}?" if near else f"{_MAKE}, or check the path"
+    )
+
+
 def _read_manifest(folder: Path, *, named: str | Path) -> TaskManifest:
     path = folder / TASK
     if not path.is_file():
-        inside = next(iter(sorted(folder.glob(f"*/{TASK}"))), None)
-        mend = "make the queries first" if inside is None else f"name a task in it, as {inside.parent}, or all by a *"
-        raise StoreError(f"{named} holds no {TASK}: {mend}")
+        raise StoreError(_no_task(folder, named))
     content = read_json(path, mend=_MEND)
     about = content if isinstance(content, dict) else {}
     for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):

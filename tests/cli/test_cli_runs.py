@@ -310,7 +310,8 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
             "--again must be one of ok, timeout, crash, invalid, refused, not applicable, got 'late'",
         ),
         (("--most-trained", "0"), "--most-trained must lie between 1 and 2000, got 0"),
-        (("--tasks", "nowhere"), "nowhere holds no task.json: make the queries first"),
+        (("--tasks", "nowhere"), "there is no folder nowhere: make the queries first (make-queries, "),
+        (("--tasks", f"{TASK}x"), f"there is no folder {TASK}x: did you mean {TASK}?"),
         (("--tasks", str(Path(TASK).parent)), f"holds no task.json: name a task in it, as {TASK}, or all by a *"),
         (("--out", "a-file"), "cannot be written (Not a directory)"),
     ],
@@ -445,7 +446,7 @@ def test_the_runs_of_two_matchers_are_not_validated_as_one(mistake, run_folder) 
 def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:
     path = mine()
     words = ("validate", "--predictions")
-    assert "nowhere holds no task.json: make the queries first" in mistake(*words, path, "--tasks", "nowhere")
+    assert "there is no folder nowhere: make the queries first" in mistake(*words, path, "--tasks", "nowhere")
     for more in ((), ("--tasks", TASK)):  # what is wrong with the answers is told first
         assert "there is no region, task, split or run 'nowhere'" in mistake(*words, "nowhere", *more)
     assert "mine.parquet holds answers: name --tasks, task folders or the stored results" in mistake(*words, path)

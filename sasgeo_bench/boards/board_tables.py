@@ -68,13 +68,13 @@ SHOWN_COSTS: Final = (  # and of the table of costs
 _SOUND: Final = ("ok", "not applicable")  # all else is a miss
 _PRIOR_ALONE: Final = "prior_centre"
 _ODOMETER_ALONE: Final = "dead_reckoning"
-_OF_FLIGHTS: Final = (
-    "right_accepted",
-    "false_accepted",
-    "error_p95",
-    "first_fix",
-    "longest_without_fix_m",
-)  # beside the first
+_OF_FLIGHTS: Final = {  # beside the first, with their titles
+    "right_accepted": "right_accepted",
+    "false_accepted": "false_accepted",
+    "error_p95": "error_p95 (m)",
+    "first_fix": "first_fix (m)",
+    "longest_without_fix_m": "longest_without_fix_m",
+}
 _USES: Final[Mapping[str, Mapping[str, str]]] = {  # what an integrator asks, by track, under the names of the field
     LOCALIZATION: {
         "within_10m": "R@10 m",
@@ -194,6 +194,7 @@ class Book:
         """Return the column of a term, which may be a metric of another package."""
         metric, plain = self.metrics.get(term), column(term, order=order)
         if metric is None:
+            plain = replace(plain, name=_OF_FLIGHTS.get(term, plain.name))
             return replace(plain, meaning=self.own[term].meaning) if term in self.own else plain
         unit = "" if metric.unit == "1" else f" ({metric.unit})"
         return replace(plain, name=f"{term}{unit}", meaning=metric.to_text())
@@ -567,7 +568,10 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
     columns = (
         *(_suite_column(book, key, primary, has_absent=key in absent) for key in shown),
         *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
-        *(replace(book.column(limit), name=f"{key[0]}: {limit}") for key, limit in limits),
+        *(
+            replace(book.column(limit), name=limit if len(shown) == 1 else f"{key[0]}: {limit}")
+            for key, limit in limits
+        ),
         *([column("mean")] if has_mean else []),
     )
     return Table(
@@ -622,8 +626,11 @@ def _overview_heads(book: Book, keys: Sequence[Key], absent: Sequence[Key], prim
 
     Their last `empty` columns say nothing.
     """
-    lines = {"queries": [plain_cell(_count(book, key, primary)) for key in keys]}
-    beside = {"queries": [plain_cell(_count(book, key, FALSE_ABSENT.name)) for key in absent]}
+    what = "queries"
+    if keys and keys[0][1] == SEQUENCE:
+        what = "flights under stress" if any(STRESS in book.strata[key] for key in keys) else "flights"
+    lines = {what: [plain_cell(_count(book, key, primary)) for key in keys]}
+    beside = {what: [plain_cell(_count(book, key, FALSE_ABSENT.name)) for key in absent]}
     for title, metric in ((AT_MOST, CEILING.name), ("chance", CHANCE.name)):
         rows = [next(filter(None, (book.main(key, name, metric) for name in book.matchers[key])), None) for key in keys]
         lines[title] = [number_cell(_value_of(row)) for row in rows]

@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -267,7 +268,8 @@ def _image(query: Query, number: int) -> AerialImage:
 
 def _segmented(ready: _ReadySegmenter, task: Task) -> tuple[Path, list[str]]:
     """Segment one task unless that is done already; return the folder of the task that results, and what to tell."""
-    about, root = task.manifest, task.root
+    # what is printed is relative where the task was named so
+    about, root = task.manifest, task.root if task.folder.is_absolute() else Path(os.path.relpath(task.root))
     suite, record = name_of(about.suite, ready.name), ready.record(task)
     folder = root / "tasks" / suite / about.region
     if _is_made(folder, record, root):

@@ -208,7 +208,7 @@ def test_a_run_says_what_is_left_is_cut_off_goes_on_and_is_validated_and_merged(
     assert f"{len(ids)} queries left, 0 done" in printed
     assert not (out / "runs").exists()
     code, printed, err = program(*GOOD, "--limit", "2")
-    assert (code, err) == (0, "good 1: 2 ok\n")
+    assert (code, err) == (0, "good, version 1: 2 ok\n")
     folder = Path(printed.strip())
     assert folder.parts[:3] == ("out", "runs", "good")
     code, printed, err = program("validate", "--predictions", folder, "--tasks", TASK)
@@ -302,6 +302,7 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
     [
         (("--shard", "0/2"), "--shard must be i/n with 1 <= i <= n, got 0/2"),
         (("--limit", "-1"), "--limit must be at least 1, got -1"),
+        (("--match-s", "30s"), "'--match-s': give the number alone, no unit"),
         (("--match-s", "nan"), "--match-s must be seconds between 0 and 604800, got nan"),
         (("--memory-mb", "1"), "--memory-mb must lie between 64 and 4000000, got 1"),
         (("--scratch-mb", "0"), "--scratch-mb must lie between 1 and 4000000, got 0"),

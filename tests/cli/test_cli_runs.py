@@ -215,7 +215,7 @@ def test_a_run_says_what_is_left_is_cut_off_goes_on_and_is_validated_and_merged(
     assert (code, err) == (2, f"{folder}: {len(ids) - 2} violations\n")
     assert all(line.endswith("expected one for every query") for line in printed.splitlines())
     code, printed, err = program(*GOOD, "--jobs", "2")
-    assert (code, printed, err) == (0, f"{folder}\n", f"good 1: {len(ids) - 2} ok\n")
+    assert (code, printed, err) == (0, f"{folder}\n", f"good, version 1: {len(ids) - 2} ok\n")
     code, printed, err = program("validate", "--predictions", folder, "--tasks", TASK)
     assert (code, printed, err) == (0, f"{folder}: answers every query of 1 task, and nothing else\n", "")
     code, printed, err = program("merge", "--runs", folder, "--into", "all.parquet")

@@ -17,7 +17,7 @@ from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.preview import paint_evidence
+from sasgeo_bench.regions.painting import paint_evidence
 from sasgeo_bench.scoring.flights import SHARE_INSIDE
 from sasgeo_bench.scoring.relative_pose import relative_errors
 from sasgeo_bench.scoring.score import FIX_M

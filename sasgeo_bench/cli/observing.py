@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final
 
+import pyarrow as pa
 import typer
 
 from sasgeo_bench.cli.built_regions import built_region
@@ -22,6 +23,7 @@ from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
 from sasgeo_bench.observing.results import PAGE, Strips, write_results
 from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
+from sasgeo_bench.running.memory import be_lean
 from sasgeo_bench.sensing.video import EVERY_S, is_video
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
@@ -208,6 +210,8 @@ def notes_of(fixes: Sequence[Fix]) -> list[str]:
 
 def locate_command(options: LocateOptions) -> None:
     """Find out where pictures of your own were taken, and how far to trust it: a line for each, tables and a page."""
+    be_lean()
+    pa.set_memory_pool(pa.system_memory_pool())  # Arrow's own keeps what was freed
     with said_after() as say_later:
         found = locate(**vars(options) | {"say": say_later})
     counts = Counter(fix.status for fix in found.fixes)

@@ -37,9 +37,9 @@ from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.packed_map import UNPACKED
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
-from sasgeo_bench.running.plan import hidden_below, matcher_code, segmenter_code
-from sasgeo_bench.running.segmenting import SegmenterProcess
-from sasgeo_bench.running.worker import Reach, Worker, guarded
+from sasgeo_bench.running.plugin_code import matcher_code, segmenter_code
+from sasgeo_bench.running.segmenter_process import SegmenterProcess
+from sasgeo_bench.running.worker import Reach, Worker, guarded, hidden_below
 from sasgeo_bench.sensing.birdseye import to_evidence
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.photos import MOST_BYTES
@@ -187,9 +187,9 @@ class _Asker:
             hidden=[*hidden, *(request.out.resolve() / name for name in ("regions", UNPACKED))],
             is_sandboxed=request.is_sandboxed,
         )
-        self._segmenter = SegmenterProcess(spec=request.segmenter, reach=reach, limits=request.limits)
+        self._segmenter = SegmenterProcess(spec=request.segmenter, reach=reach, limits=request.limits, is_lean=True)
         reach = Reach(readable=[region.resolve()], hidden=hidden, is_sandboxed=request.is_sandboxed)
-        self._worker = Worker(spec=request.matcher, reach=reach, limits=request.limits)
+        self._worker = Worker(spec=request.matcher, reach=reach, limits=request.limits, is_lean=True)
         self._threads = ThreadPoolExecutor(3)
         self._codes: Future[tuple[str, str]] = self._threads.submit(
             lambda: (matcher_code(request.matcher), segmenter_code(request.segmenter))

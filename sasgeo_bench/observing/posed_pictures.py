@@ -35,7 +35,8 @@ from sasgeo_bench.observing.pictures import (
     resized,
 )
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
-from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
+from sasgeo_bench.sensing.dem import read_dem
+from sasgeo_bench.sensing.ground import Dem, Plane
 from sasgeo_bench.sensing.photos import DJI, MOST_BYTES, Photo, PhotoHead, number_of, photo_of, read_head
 
 GPS_SIGMA_M: Final = 3.3  # of one axis: 95 % within 8 m, as the GPS performance standard of 2020 states it

@@ -203,7 +203,7 @@ def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], scored: Sc
 def _example(task: Task) -> bytes:
     shown = panels_of(task, choose=control_and_stress)
     title = f"{task.manifest.title}: {task.manifest.region}"
-    sheet = sheet_figure(title, shown, dpi=_SHEET_DPI, credit=task.manifest.provenance.credit)
+    sheet = sheet_figure(title, shown, dpi=_SHEET_DPI, credit=task.manifest.credit)
     return fitted(pixels_of(sheet), SUITE_BYTES)
 
 

@@ -89,10 +89,7 @@ def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = No
                 key = asker.key(path, name)
                 fix = kept.get(key)
                 if fix is None or (watch is not None and not watch.is_shown(number, fix) and fix.view is not None):
-                    seen = asker.ask(path, name, key)
-                    fix = seen if isinstance(seen, Fix) else seen.fix
-                    if watch is not None and isinstance(seen, Seen):
-                        watch.seen(number, seen)
+                    fix = _watched(asker.ask(path, name, key), number, watch)
                     if fix.status != "failed":
                         file.write(json.dumps({"key": key, "fix": asdict(fix)}) + "\n")
                         file.flush()
@@ -105,6 +102,15 @@ def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = No
             fixes=tuple(fixes),
             calibration=asker.calibration,
         )
+
+
+def _watched(seen: Seen | Fix, number: int, watch: Watch | None) -> Fix:
+    """Show a picture to a watch, and return its fix; nothing else of it is kept while the next one is asked."""
+    if isinstance(seen, Fix):
+        return seen
+    if watch is not None:
+        watch.seen(number, seen)
+    return seen.fix
 
 
 def read_answers(path: Path) -> dict[str, Fix]:

@@ -389,6 +389,8 @@ def _origin(
         map_date=state.date.isoformat(),
         map_fingerprint=manifest.fingerprint,
         map_inputs_sha256=manifest.inputs_sha256,
+        licence=manifest.licence,
+        attribution=manifest.attribution,
         provenance=manifest.provenance,
         split=spec.id,
         split_sha256=hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),

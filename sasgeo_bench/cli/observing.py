@@ -92,6 +92,10 @@ class SearchOptions(Options):
     ] = None
     height: Annotated[float | None, typer.Option(help="of the camera above the ground, metres")] = None
     ground_width: Annotated[float | None, typer.Option(help="width of the ground in each picture, metres")] = None
+    dem: Annotated[
+        Path | None,
+        typer.Option(help="GeoTIFF of the ground's heights, for photos with an altitude and no height above take-off"),
+    ] = None
     matcher: Annotated[str, typer.Option(help="name from list matchers, or module:Class")] = MATCHER
     segmenter: Annotated[str, typer.Option(help="name from list segmenters, with weights, or module:Class")] = SEGMENTER
     exif_position: Annotated[
@@ -146,6 +150,8 @@ def locate(options: LocateOptions) -> Located:
         weights = unpack_map(options.region, options.out).about.weights
         if weights is not None:
             tell(f"what {weights.matcher} has learned is left packed: P(false fix) is calibrated without it")
+    if options.dem is not None and not options.dem.is_file():
+        raise ConfigError(f"there is no file of heights {options.dem}: check the path")
     into = options.into or options.out / "locate" / _name_of(options.pictures)
     heading = None if options.heading in (None, "any") else _heading(options.heading or "")
     request = LocateRequest(
@@ -157,7 +163,7 @@ def locate(options: LocateOptions) -> Located:
         radius_m=options.radius,
         heading=heading,
         is_turned=options.heading == "any",
-        told=Told(height_m=options.height, ground_width_m=options.ground_width),
+        told=Told(height_m=options.height, ground_width_m=options.ground_width, dem=options.dem),
         matcher=options.matcher,
         segmenter=options.segmenter,
         uses_position=options.exif_position,

@@ -28,6 +28,7 @@ from sasgeo_bench.observing.fixes import SEGMENTER, Fix, Located, LocateRequest,
 from sasgeo_bench.observing.pictures import (
     OwnPicture,
     Sight,
+    Told,
     list_pictures,
     names_of,
     open_picture,
@@ -394,7 +395,7 @@ class _Asker:
             east_m, north_m, _ = to_grid(*picture.lonlat, self._manifest.epsg)
             away_m = round(math.hypot(stood.easting_m - east_m, stood.northing_m - north_m), 2)
         p_false = None if self.chances is None else round(self.chances.p_false(answer), 4)
-        status, reason = verdict(answer, p_false, prior, self._request.most_false)
+        status, reason = verdict(answer, p_false, prior, side_m=sight.side_m, most_false=self._request.most_false)
         return replace(
             known,
             status=status,
@@ -426,11 +427,18 @@ def answer_key(request: LocateRequest, manifest: Manifest, codes: tuple[str, str
         request.radius_m,
         request.heading,
         request.is_turned,
-        asdict(request.told),
+        _told(request.told),
         request.uses_position,
         request.most_false,
     ]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _told(told: Told) -> dict[str, float | str]:
+    """Return what a user says of pictures; keys are as before without a file of heights."""
+    said = asdict(replace(told, dem=None))
+    del said["dem"]
+    return said | ({} if told.dem is None else {"dem": _content(told.dem)})
 
 
 def prior_of_view(prior: Prior, middle_m: tuple[float, float]) -> Prior:

@@ -428,6 +428,8 @@ def test_a_georeferenced_picture_needs_no_table(towns, region, middle, tmp_path)
     assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.01)
     assert abs((truth.pose.yaw_deg + 180) % 360 - 180) < 0.01
     assert truth.measured["truth_sigma_m"] == 0.5
+    _, lines = quiet(replace(request, heights=Heights(height_m=80.0)))
+    assert "heights are passed over of 1 georeferenced picture: each tells its size" in lines
 
 
 def exif_of(region, place):

@@ -21,7 +21,7 @@ from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import to_grid
-from sasgeo_bench.observing.picture_poses import PicturePose, PoseTable, picture_heading_deg
+from sasgeo_bench.observing.picture_poses import STRAIGHT_DOWN, PicturePose, PoseTable, picture_heading_deg
 from sasgeo_bench.observing.pictures import (
     LEAST_M,
     STEEPEST_DEG,
@@ -156,10 +156,11 @@ def pose_pictures(
                     continue
             row = None if table is None else table.find(name)
             if table is not None and row is None:
-                found.left_out["that the table does not name, or in another folder"].append(name)
+                found.left_out[table.why_not(name)].append(name)
                 continue
             taken[row.name if row is not None else ""] += 1
-            stand = _stand(path, name, row, epsg, sigma_m)
+            hint = STRAIGHT_DOWN if table is None else table.angles_hint
+            stand = _stand(path, name, row, hint, epsg=epsg, sigma_m=sigma_m)
         except SasgeoError as error:
             found.left_out[f"that cannot be read ({reason_of(error, path)})"].append(name)
             continue
@@ -269,8 +270,10 @@ def _fitted(lens: Intrinsics, photo: Photo) -> Intrinsics | None:
     return resized(lens, (photo.width_px, photo.height_px), (across, down))
 
 
-def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: float | None) -> _Stand | str:
-    """Return where a photo was taken, or why that is not known."""
+def _stand(
+    path: Path, name: str, row: PicturePose | None, hint: str, *, epsg: int, sigma_m: float | None
+) -> _Stand | str:
+    """Return where a photo was taken, or why that is not known; `hint` says how angles of cameras can be told."""
     photo, of_file_m = _photo(path)
     heading_note = ""
     if row is not None:
@@ -287,7 +290,7 @@ def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: f
     if photo.lon_deg is None or photo.lat_deg is None:
         return "without a position"
     if photo.gimbal is None:
-        return "without angles of the camera (a column gimbal_pitch of -90 says straight down)"
+        return f"without angles of the camera ({hint})"
     place_m = to_grid(photo.lon_deg, photo.lat_deg, epsg)[:2] if row is None else row.in_crs(epsg)
     stated = of_file_m if row is None else row.sigma_m
     stated = sigma_m if stated is None else stated

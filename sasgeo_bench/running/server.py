@@ -50,17 +50,22 @@ class PluginServer(ABC, Generic[Plugin]):
                 message, blob = wire.receive(self.channel)
             except wire.Closed:
                 return
-            head = {"nonce": message["nonce"]}
-            fields = {name: value for name, value in message.items() if name not in {"kind", "nonce"}}
-            try:
-                content, data = getattr(self, f"_{message['kind']}")(blob, **fields)
-                answer = wire.packed({**head, "status": "ok", **content}, data)
-            except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
-                answer = wire.packed({**head, **_failure(error, plugin=self._made)})
+            answer = self._answered(message, blob)
             try:
                 wire.put(self.channel, answer)
             except wire.Closed:  # the runner waited no longer
                 return
+            del message, blob, answer  # megabytes of a picture, while the next one is waited for
+
+    def _answered(self, message: wire.Message, blob: bytes) -> bytes:
+        """Return the answer to a question as it is sent."""
+        head = {"nonce": message["nonce"]}
+        fields = {name: value for name, value in message.items() if name not in {"kind", "nonce"}}
+        try:
+            content, data = getattr(self, f"_{message['kind']}")(blob, **fields)
+            return wire.packed({**head, "status": "ok", **content}, data)
+        except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
+            return wire.packed({**head, **_failure(error, plugin=self._made)})
 
     @abstractmethod
     def _make(self) -> Plugin:

@@ -181,7 +181,7 @@ def _add_regions(found: _Found, asked: Sequence[tuple[str, str]], root: Path, sp
 def _map(folder: Path, manifest: Manifest) -> bytes:
     """Return a map that fills its picture."""
     colours = paint_overview(manifest, read_overview(folder / region_files.LAYERS, longest_cells=_MAP_CELLS))
-    return fitted(np.ascontiguousarray((255 * colours[..., ::-1]).round().astype(np.uint8)), REGION_BYTES)
+    return fitted(np.ascontiguousarray(colours[..., ::-1]), REGION_BYTES)
 
 
 def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], scored: Scored) -> None:

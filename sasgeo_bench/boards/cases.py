@@ -301,7 +301,7 @@ _HALO: Final = (patheffects.withStroke(linewidth=2.6, foreground="white"),)
 class MapPart:
     """A piece of a map as it is drawn: colours of shape (rows, cols, 3), and its edges in metres."""
 
-    colours: NDArray[np.float64]
+    colours: NDArray[np.uint8]
     west_m: float
     south_m: float
     east_m: float

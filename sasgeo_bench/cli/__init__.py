@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program `sasgeo-bench`: a file for each family of commands."""
 
+import gc
 import os
 import sys
 
@@ -12,6 +13,8 @@ def main() -> None:
     with interrupted_by_signals():
         # Arrow's own pool keeps what was freed: 25 to 50 MB of a build.
         os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+        # A command makes hundreds of thousands of objects that stay: to look for cycles among them took a tenth of it.
+        gc.set_threshold(100_000)
         try:
             from sasgeo_bench.cli import program  # noqa: PLC0415 - takes a third of a second, in which users press Ctrl-C
 

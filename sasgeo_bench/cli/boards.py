@@ -37,6 +37,7 @@ from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.running.failures import log_beside
 from sasgeo_bench.scoring.intervals import DRAWS
+from sasgeo_bench.scoring.requirements import own_metrics, parse_requirements
 from sasgeo_bench.tasks.task_files import TRUTH
 
 CONTROL_FAILED: Final = 3  # exit status
@@ -234,6 +235,8 @@ class LeaderboardOptions(Options):
     opened: Annotated[
         str | None, typer.Option(help="day on which sealed places are opened, as in 2026-11-23; default: today (UTC)")
     ] = None
+    within: Within = None
+    require: Require = None
     private: Private = None
     results: Results = None
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")] = (
@@ -248,6 +251,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     file = find_pipeline_file(options.pipeline)
     spec = read_pipeline_file(file)
     opened = None if options.opened is None else read_day(options.opened, flag="--opened")
+    own_metrics(options.within or (), parse_requirements(options.require or ()))  # before hours of runs
     _begin(file, spec.archive, options)
     plan = plan_pipeline(
         spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(options.matcher or ()))))}),
@@ -257,7 +261,9 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         private=private_seed(options.seed_file),
         sealed=sealed_seed(options.sealed_seed_file),
     )
-    plan = replace(plan, jobs=options.jobs, dask=options.dask)
+    plan = replace(
+        plan, jobs=options.jobs, dask=options.dask, within=options.within or (), require=options.require or ()
+    )
     if opened is not None:
         if plan.seal is None or plan.seal.seed is None:
             raise ConfigError(

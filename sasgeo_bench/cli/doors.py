@@ -160,10 +160,11 @@ def _list(kind: str, door: _Door) -> None:
 
 def _list_regions(folders: Iterable[Path] | None) -> None:
     from sasgeo_bench.core.config import shipped_dir  # noqa: PLC0415
-    from sasgeo_bench.regions.region_spec import list_region_files, read_region_file  # noqa: PLC0415
+    from sasgeo_bench.regions.region_spec import OWN_FOLDER, list_region_files, read_region_file  # noqa: PLC0415
 
     table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)
-    files = list_region_files(folders=tuple(folders or ()))
+    own = (OWN_FOLDER,) if OWN_FOLDER.is_dir() else ()
+    files = list_region_files(folders=(*(folders or ()), *own))
     shipped = shipped_dir("regions")
     of_demo = sorted(name for name, path in files.items() if name.startswith(_OF_DEMO) and path.parent == shipped)
     for name in sorted(files.keys() - set(of_demo)):

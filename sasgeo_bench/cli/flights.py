@@ -24,7 +24,7 @@ from sasgeo_bench.flights.drift_profile import write_drift_profile
 from sasgeo_bench.flights.log_odometry import LoggedRuns, read_runs
 from sasgeo_bench.flights.log_points import FlightLog, steps_m
 from sasgeo_bench.flights.log_units import SPEED_MPS, AngleUnit, HeightUnit, LogFacts, PlaceUnit, TimeUnit
-from sasgeo_bench.flights.logs import SHORTEST_FLOWN_M, FlownPath, gaps_of, is_tum, read_log, read_poses
+from sasgeo_bench.flights.logs import SHORTEST_FLOWN_M, FlownPath, OdometryOf, gaps_of, is_tum, read_log, read_poses
 from sasgeo_bench.flights.plans import MARGIN_M
 from sasgeo_bench.flights.trajectory import Axes, Trajectory, read_tum, write_tum
 from sasgeo_bench.regions.region_files import MANIFEST, read_manifest, read_region
@@ -35,6 +35,19 @@ from sasgeo_bench.tasks.task_files import TASK, Task
 AxesFlag = Annotated[
     Axes | None,
     typer.Option(help="axes of TUM files: up (third axis up), or camera (right, down, ahead: KITTI, ORB-SLAM)"),
+]
+OdometryFlag = Annotated[
+    OdometryOf,
+    typer.Option(
+        help="of the flight: that of its log where this fused no GNSS, or drawn by a profile of drift (drawn)"
+    ),
+]
+DriftFlag = Annotated[
+    str | None,
+    typer.Option(
+        help="profile of drift that the odometry of the flight declares, and is drawn by: a file of measure-drift "
+        "--profile, or a name, as vio-mono; default: that of the suite"
+    ),
 ]
 VehicleFlag = Annotated[int | None, typer.Option(help="system id of the vehicle in a .tlog of several")]
 
@@ -53,9 +66,10 @@ class FlightOptions(Options):
         str | None, typer.Option(help="region that was flown over: id, or own file; its queries are drawn")
     ] = None
     suite: Annotated[str, typer.Option(help="suite of flights whose views are drawn along it")] = "flight-clean"
-    prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
-        None
-    )
+    prior: Annotated[
+        str | None,
+        typer.Option(help="prior group, as in r500-weak-s3, of flights also gnss; default: that of the suite"),
+    ] = None
     seed: Annotated[int, typer.Option(min=0, help="public random seed")] = 0
     extracts: ExtractFolders = None
     region_files: OwnRegionFolders = None
@@ -85,6 +99,9 @@ class FlightOptions(Options):
     place_unit: Annotated[PlaceUnit | None, typer.Option(help="of latitude and longitude (e7: 1e-7 degrees)")] = None
     axes: AxesFlag = None
     vehicle: VehicleFlag = None
+    odometry: OdometryFlag = "log"
+    drift: DriftFlag = None
+    topic: Annotated[str | None, typer.Option(help="topic of a bag with odometry that fused no GNSS")] = None
 
     @property
     def facts(self) -> LogFacts:
@@ -105,7 +122,15 @@ class FlightOptions(Options):
     def flown(self) -> FlownPath:
         """Return the flight."""
         least_m = SHORTEST_FLOWN_M if self.least_m is None else self.least_m
-        return FlownPath(file=self.file, facts=self.facts, height_m=self.height, least_m=least_m)
+        return FlownPath(
+            file=self.file,
+            facts=self.facts,
+            height_m=self.height,
+            least_m=least_m,
+            odometry=self.odometry,
+            topic=self.topic,
+            drift=self.drift,
+        )
 
 
 @takes(FlightOptions)
@@ -139,8 +164,8 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
     """
     _check_outputs([options.file], [options.tum] if options.tum else [])
     if options.region is None:
-        for name in ("tum", "least_m", "dem", "takeoff_height"):
-            if getattr(options, name) is not None:
+        for name in ("tum", "least_m", "dem", "takeoff_height", "topic", "odometry", "drift"):
+            if getattr(options, name) not in (None, "log"):
                 raise FlightError(f"--{name.replace('_', '-')} needs --region: it is about the stretch over a region")
         if is_tum(options.file):
             poses = read_poses(options.file, options.facts, height_m=options.height)
@@ -170,10 +195,11 @@ def import_flight(options: FlightOptions) -> tuple[Path, ...]:
     (request,) = plan_requests(wanted)
     suite = request.found
     before = options.out / "tasks" / request.suite / request.region.id
-    if (before / TASK).is_file() and made_tasks(request) is None:
-        tell(f"{before} holds the queries of another flight or request, which are replaced (another --out keeps both)")
+    is_other = (before / TASK).is_file() and made_tasks(request) is None
     tasks = make_tasks(request)
-    kinds = ", ".join(dict.fromkeys(f"{variant.kind} ({variant.role})" for variant in suite.variants))
+    if is_other:
+        tell(f"{before} held the queries of another flight or request: they are replaced (another --out keeps both)")
+    kinds = ", ".join(dict.fromkeys(f"{truth.kind} ({truth.role})" for task in tasks for truth in task.truths))
     tell(f"the flight is asked once for each of: {kinds}")
     if not suite.is_pictured:
         tell(f"views of {request.suite} are {suite.main_side_m:g} m wide, whatever the height of the flight")
@@ -373,7 +399,10 @@ def _lines(log: FlightLog, speed_mps: float) -> Iterator[str]:
             what, _, unit = name.partition("_")
             yield f"{what} from {values.min():.1f} to {values.max():.1f} {unit}"
     lon, lat = log.lon_deg, log.lat_deg
-    yield f"longitude from {lon.min():.4f} to {lon.max():.4f}, latitude from {lat.min():.4f} to {lat.max():.4f} deg"
+    west, east = lon.min(), lon.max()
+    if east - west > 180:  # over the antimeridian
+        west, east = lon[lon > 0].min(), lon[lon <= 0].max()
+    yield f"longitude from {west:.4f} to {east:.4f}, latitude from {lat.min():.4f} to {lat.max():.4f} deg"
     if log.time_s is None:
         tell(f"no times: a flight has an even speed (--speed-mps, {speed_mps:g} m/s)")
     if log.height_m is None:

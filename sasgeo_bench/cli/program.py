@@ -61,7 +61,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Runs": {
         "run": "runs",
         "merge": "runs",
-        "profile": "runs",
+        "profile": "profiling",
         "submit": "entering",
         "enter": "entering",
     },
@@ -116,6 +116,7 @@ KEPT: Final = {
     "send": "files that were sent are kept; the same command sends the others",
     "fetch": "files that were fetched are kept beside the folder; the same command fetches the others",
 }
+_HELP_WORDS: Final = {"help_option_names": ["-h", "--help"]}
 _NOTHING: Final = "nothing is half-written, and what was there before is kept; run it again"
 
 
@@ -132,7 +133,7 @@ class _Group(TyperGroup):
         """Write the commands in the groups of the work."""
         for group, names in COMMANDS.items():
             with formatter.section(group):
-                formatter.write_dl([(name, (self.commands[name].help or "").partition("\n\n")[0]) for name in names])
+                formatter.write_dl([(name, help_of(file, name).partition("\n\n")[0]) for name, file in names.items()])
 
 
 def spelled_out(words: Sequence[str], params: Sequence[Any]) -> list[str]:
@@ -162,7 +163,7 @@ def spelled_out(words: Sequence[str], params: Sequence[Any]) -> list[str]:
 def load(name: str) -> Any:  # noqa: ANN401 - typer makes its commands of a class that it does not name
     """The command of a name, as typer makes it of the function behind it."""
     file = next(group[name] for group in COMMANDS.values() if name in group)
-    alone = typer.Typer(add_completion=False)
+    alone = typer.Typer(add_completion=False, context_settings=_HELP_WORDS)
     function = getattr(import_module(f"sasgeo_bench.cli.{file}"), _function_of(name))
     alone.command(name)(_with_outlets(with_flags(function)))
     return typer.main.get_command(alone)
@@ -219,7 +220,14 @@ def _print_version(*, is_asked: bool) -> None:
 
 
 # Plain help: what draws boxes around it takes longer to load than all else.
-app = typer.Typer(cls=_Group, no_args_is_help=True, pretty_exceptions_enable=False, help=HELP, rich_markup_mode=None)
+app = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help=HELP,
+    rich_markup_mode=None,
+    context_settings=_HELP_WORDS,
+)
 
 
 @app.callback()
@@ -233,8 +241,8 @@ def _program(
 
 
 for _commands in COMMANDS.values():
-    for _name, _file in _commands.items():
-        app.command(_name, help=help_of(_file, _name))(lambda: None)
+    for _name in _commands:
+        app.command(_name)(lambda: None)
 
 
 def _warn(
@@ -255,9 +263,7 @@ _UsageError: Any = typer.BadParameter.__base__
 
 
 def _tell_usage(error: Any) -> None:  # noqa: ANN401 - see _UsageError
-    """Print a wrong word on the command line as one line; without any words the help is printed already."""
-    if len(sys.argv) == 1:
-        return
+    """Print a wrong word on the command line as one line."""
     text = error.format_message().strip().removesuffix(".")
     command = error.ctx.command_path if error.ctx is not None else "sasgeo-bench"
     complain(f"sasgeo-bench: {one_line(f'{text[:1].lower()}{text[1:]}')} (see '{command} --help')")
@@ -277,6 +283,9 @@ def _status() -> int:
     try:
         status = int(app(prog_name="sasgeo-bench", standalone_mode=False) or 0)
     except _UsageError as error:
+        if len(sys.argv) == 1:
+            say(error.ctx.get_help())
+            return 0
         _tell_usage(error)
         return EXIT_USER
     except SasgeoError as error:

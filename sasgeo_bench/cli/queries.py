@@ -14,7 +14,7 @@ from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, OwnRegi
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.progress import reported, spread, tell
-from sasgeo_bench.flights.logs import FlownPath
+from sasgeo_bench.flights.logs import FlownPath, OdometryOf
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
@@ -46,9 +46,10 @@ class QueryOptions(Options):
     n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8
     seed: Annotated[int | None, typer.Option(min=0, help="public random seed; default: 0")] = None
     seed_file: SeedFile = None
-    prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
-        None
-    )
+    prior: Annotated[
+        str | None,
+        typer.Option(help="prior group, as in r500-weak-s3, of flights also gnss; default: that of the suite"),
+    ] = None
     detector: Annotated[
         list[str] | None,
         typer.Option(
@@ -67,6 +68,19 @@ class QueryOptions(Options):
         typer.Option(help="log of a flight that was flown, for suites of flights; it is their one site"),
     ] = None
     height: Annotated[float | None, typer.Option(help="of that flight above the ground, instead of the log's")] = None
+    odometry: Annotated[
+        OdometryOf,
+        typer.Option(
+            help="of that flight: of its log where this fused no GNSS, or drawn by a profile of drift (drawn)"
+        ),
+    ] = "log"
+    drift: Annotated[
+        str | None,
+        typer.Option(
+            help="profile of drift that its odometry declares, and is drawn by: a file of measure-drift --profile, or "
+            "a name, as vio-mono; default: that of the suite"
+        ),
+    ] = None
     up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False
     skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False
@@ -130,10 +144,11 @@ def make_queries_command(options: QueryOptions) -> None:
 
 def _flown(options: QueryOptions) -> FlownPath | None:
     if options.flight is None:
-        if options.height is not None:
-            raise ConfigError("--height is of a flight: name its log by --flight")
+        for name in ("height", "odometry", "drift"):
+            if getattr(options, name) not in (None, "log"):
+                raise ConfigError(f"--{name} is of a flight: name its log by --flight")
         return None
-    return FlownPath(file=options.flight, height_m=options.height)
+    return FlownPath(file=options.flight, height_m=options.height, odometry=options.odometry, drift=options.drift)
 
 
 def _folder(request: Request) -> Path:

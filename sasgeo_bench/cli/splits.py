@@ -54,7 +54,7 @@ def new_split(options: SplitOptions) -> Path:
     >>> sgb.new_split("mine", ["vadus", "monaco"])
     Traceback (most recent call last):
         ...
-    sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
+    sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions or new-region)
     """
     specs = [read_region_file(find_region_file(name, folders=options.region_files or ())) for name in options.region]
     grids = {spec.id: spec.grid() for spec in specs}

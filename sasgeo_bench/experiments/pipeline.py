@@ -80,6 +80,8 @@ def run_pipeline(
         split=plan.split,
         rejectors=plan.spec.rejectors,
         metrics=plan.spec.metrics,
+        within=plan.within,
+        require=plan.require,
         contrasts=contrasts,
         draws=plan.spec.draws,
         pipeline=plan.spec.identity,

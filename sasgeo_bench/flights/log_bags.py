@@ -37,6 +37,7 @@ from sasgeo_bench.flights.log_streams import (
     known_fields,
     library,
     quaternions_of_enu,
+    stated_of,
 )
 
 if TYPE_CHECKING:
@@ -112,6 +113,13 @@ def read_bag(path: Path) -> FlightLog:
         has_px4 = any(topic in log_ulog.PLACES for topic, _ in topics.topics)
         streams = log_ulog.streams_of(topics) if has_px4 else _ros_streams(bag)
     return flight_of(bag.source, streams)
+
+
+def read_receivers(path: Path) -> list[Fixes]:
+    """Read the receivers of a bag on one clock, in the order in which one is taken for the truth."""
+    with _opened(path) as bag, known_fields(bag.source):
+        receivers = log_ulog.receivers_of(_px4_topics(bag, log_ulog.RECEIVERS))
+        return receivers or list(_RosPlaces.of(bag).receivers)
 
 
 def read_odometry(path: Path, *, topic: str | None = None) -> LoggedOdometry:
@@ -302,7 +310,7 @@ _NUMBERS: Final = frozenset(
     {
         *("timestamp", "time_utc_usec", "lat", "lon", "alt", "latitude_deg", "longitude_deg", "altitude_msl_m", "eph"),
         *("fix_type", "lat_lon_valid", "x", "y", "z", "xy_valid", "z_valid", "landed", "q", "position"),
-        *("control_mode_flags", *log_ulog.FUSING),
+        *("control_mode_flags", *log_ulog.FUSING, "reset_counter", "xy_reset_counter"),
     }
 )
 
@@ -322,11 +330,12 @@ def _spread(names: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _RosPlaces:
-    """Fixes of the topic that is read, a note on the others, and its clock."""
+    """Fixes of the topic that is read, a note on the others, and its clock; `receivers` are in the order of choice."""
 
     fixes: Fixes
     notes: tuple[str, ...]
     clock: "_RosClock"
+    receivers: tuple[Fixes, ...]
 
     @classmethod
     def of(cls, bag: _Bag) -> "_RosPlaces":
@@ -344,7 +353,10 @@ class _RosPlaces:
         found = [make(bag.source, table, clocks[table.name].seconds(table)) for table, make in tables]
         what = f"NavSatFix, LocationFix, geographic_msgs or {_PX4.partition('/')[0]}"
         fixes, notes = first_with_fixes(bag.source, found, what)
-        return cls(fixes=fixes, notes=notes, clock=clocks[fixes.track.name])
+        clock = clocks[fixes.track.name]
+        on_it = [make(bag.source, table, clock.seconds(table)) for table, make in tables]
+        receivers = tuple(one for one in on_it if not one.is_estimate)
+        return cls(fixes=fixes, notes=notes, clock=clock, receivers=receivers)
 
 
 def _ros_streams(bag: _Bag) -> Streams:
@@ -367,7 +379,8 @@ def _fixes_of_ros(source: LogSource, table: _Table, time_s: Floats, *, is_estima
     """Return the fixes of a NavSatFix: altitudes above the ellipsoid, no fix below 0."""
     lon, lat, alt, status, kind, variance_m2 = table.values.T
     is_fix = status >= 0
-    stated_m2 = variance_m2[is_fix & (kind > 0) & (variance_m2 > 0)]
+    is_stated = is_fix & (kind > 0) & (variance_m2 > 0)
+    stated = stated_of(source, table.name, time_s[is_stated], np.sqrt(variance_m2[is_stated]))
     return Fixes.of(
         source,
         table.name,
@@ -376,7 +389,7 @@ def _fixes_of_ros(source: LogSource, table: _Table, time_s: Floats, *, is_estima
         is_fix,
         altitude_of="ellipsoid",
         is_estimate=is_estimate,
-        accuracy_m=float(np.sqrt(np.median(stated_m2))) if len(stated_m2) else np.nan,
+        stated=stated,
     )
 
 

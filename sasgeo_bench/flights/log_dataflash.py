@@ -22,7 +22,6 @@ from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.flights.leap_seconds import GPS_EPOCH_S, WEEK_S, utc_of_gps
 from sasgeo_bench.flights.log_points import FlightLog, LogSource
 from sasgeo_bench.flights.log_streams import (
-    LEAST_FIX,
     MOST_LOG_BYTES,
     Clock,
     Estimate,
@@ -36,7 +35,10 @@ from sasgeo_bench.flights.log_streams import (
     known_fields,
     library,
     quaternions_of_angles,
+    resets_of,
+    stated_of,
 )
+from sasgeo_bench.flights.log_units import LEAST_FIX
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, Floats]
@@ -192,7 +194,7 @@ def _of_text(
 FIELDS: Final = frozenset(
     {
         *("TimeUS", "TimeMS", "T", "I", "C", "Status", "GMS", "GWk", "Week", "Lat", "Lng", "Alt", "HAcc", "RelHomeAlt"),
-        *("Yaw", "Pitch", "Roll", "PN", "PE", "PD", "SS", "PI", "PX", "PY", "PZ", "R", "P", "Y"),
+        *("Yaw", "Pitch", "Roll", "PN", "PE", "PD", "SS", "PI", "PX", "PY", "PZ", "R", "P", "Y", "Rst"),
         *(f"{what}D{axis}" for what in ("Ang", "Pos") for axis in "XYZ"),
     }
 )
@@ -230,22 +232,28 @@ def attitudes_of(messages: Messages) -> Stream | None:
 
 def fixes_of(messages: Messages) -> tuple[Fixes, tuple[str, ...]]:
     """Return the fixes of the first receiver that has two, and a note on the others."""
-    accuracies = dict(messages.instances("GPA"))
+    return first_with_fixes(messages.source, receivers_of(messages), "GPS")
+
+
+def read_receivers(path: Path) -> list[Fixes]:
+    """Read the receivers of a DataFlash log, in the order in which one is taken for the truth."""
+    messages = read_messages(path, ("GPS", "GPS2", "GPA"), FIELDS)
+    with known_fields(messages.source):
+        return receivers_of(messages)
+
+
+def receivers_of(messages: Messages) -> list[Fixes]:
+    """Return the receivers of a DataFlash log, in the order in which one is taken for the truth."""
+    source, accuracies = messages.source, dict(messages.instances("GPA"))
     found = []
     for name, columns in (*messages.instances("GPS"), *messages.instances("GPS2")):
+        places = (columns["Lng"], columns["Lat"], columns["Alt"])
+        of_name = name.replace("GPS", "GPA")
+        own = accuracies.get(of_name, {})
+        stated = stated_of(source, f"{of_name}.HAcc", seconds(own), own["HAcc"]) if "HAcc" in own else None
         is_fix = columns["Status"] >= LEAST_FIX
-        stated_m = accuracies.get(name.replace("GPS", "GPA"), {}).get("HAcc", np.empty(0))
-        stated_m = stated_m[(stated_m > 0) & np.isfinite(stated_m)]
-        fixes = Fixes.of(
-            messages.source,
-            name,
-            seconds(columns),
-            (columns["Lng"], columns["Lat"], columns["Alt"]),
-            is_fix,
-            accuracy_m=float(np.median(stated_m)) if len(stated_m) else np.nan,
-        )
-        found.append(fixes)
-    return first_with_fixes(messages.source, found, "GPS")
+        found.append(Fixes.of(source, name, seconds(columns), places, is_fix, stated=stated))
+    return found
 
 
 def estimates_of(messages: Messages) -> list[Estimate]:
@@ -257,7 +265,8 @@ def estimates_of(messages: Messages) -> list[Estimate]:
     if (columns := messages.messages.get("VISP")) is not None:
         turns = quaternions_of_angles(columns["Y"], columns["P"], columns["R"])
         poses = np.column_stack([*(columns[key] for key in ("PX", "PY", "PZ")), turns])
-        return [Estimate(poses=Stream.of(source, "VISP", seconds(columns), poses))]
+        resets_s = resets_of(seconds(columns), columns["Rst"]) if "Rst" in columns else np.empty(0)
+        return [Estimate(poses=Stream.of(source, "VISP", seconds(columns), poses), resets_s=resets_s)]
     if (columns := messages.messages.get("VISO")) is not None:
         return [Estimate(poses=Stream.of(source, "VISO", seconds(columns), _summed(columns)))]
     for poses_of, flags_of in (("XKF1", "XKF4"), ("NKF1", "NKF4")):

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Final
 
 from sasgeo_bench.flights.log_points import AltitudeOf, LogSource, listed, shown
-from sasgeo_bench.flights.log_units import WORDS, LogFacts
+from sasgeo_bench.flights.log_units import LEAST_FIX, WORDS, LogFacts
 
 QUANTITIES: Final = MappingProxyType(
     {
@@ -136,7 +136,7 @@ class Format:
     epoch: tuple[str, ...] = ()
     gps: tuple[str, ...] = ()
     counts: bool = False
-    fix: Mapping[str, float] = field(default_factory=lambda: {"fix_type": 2.0})
+    fix: Mapping[str, float] = field(default_factory=lambda: {"fix_type": LEAST_FIX})
     receiver: str = ""
     no_yaw: float | None = None
     is_sorted: bool = True
@@ -217,7 +217,7 @@ FORMATS: Final = (
         },
         altitudes={"alt": "geoid"},
         counts=True,
-        fix={"status": 2.0},
+        fix={"status": LEAST_FIX},
         receiver="i",
         no_yaw=0.0,
     ),
@@ -482,7 +482,7 @@ def unread(header: Sequence[str], layout: Layout, read: Collection[str], *, has_
     known = {column.at for name, column in layout.fields.items() if name in read}
     known |= {column.at for column in (*others, *layout.hemispheres.values()) if column is not None}
     left = [at for at, name in enumerate(header) if at not in known and name.strip()]
-    is_altitude = any(_is_altitude(layout.keys[at]) for at in left)
+    is_altitude = "altitude" not in read and any(_is_altitude(layout.keys[at]) for at in left)
     why = "; an altitude is read if one column of them states its unit" if is_altitude else ""
     return (f"not read: {listed([header[at] for at in left])}{why}",) if left else ()
 

@@ -9,30 +9,19 @@ logged.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Final
 
 import numpy as np
 import pyproj
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sasgeo_bench.core.errors import FlightError, counted
-from sasgeo_bench.flights import log_bags, log_dataflash, log_telemetry, log_ulog
+from sasgeo_bench.core.errors import counted
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, pair_run
-from sasgeo_bench.flights.log_streams import NED_OF_ENU, LoggedOdometry, Stream, turned_at
+from sasgeo_bench.flights.log_streams import NED_OF_ENU, LoggedOdometry, turned_at
+from sasgeo_bench.flights.own_odometry import quaternions_of, read_logged, why_none
 from sasgeo_bench.flights.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
-
-_READERS: Final = MappingProxyType(
-    {
-        ".ulg": log_ulog.read_odometry,
-        ".bin": log_dataflash.read_odometry,
-        ".log": log_dataflash.read_odometry,
-    }
-)
-_TELEMETRY: Final = ".tlog"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +75,7 @@ def read_runs(
         If the log has no fixes of a receiver, no odometry, or none that fused no receiver; the message names what it
         has, and the flags that tell.
     """
-    log = _read(path, vehicle, topic)
+    log = read_logged(path, vehicle=vehicle, topic=topic)
     poses = log.estimate.poses
     has_yaw = log.estimate.has_attitudes
     if log.attitudes is None and has_yaw:
@@ -96,7 +85,7 @@ def read_runs(
     stretches = _stretches(log)
     runs = [pair_run(truth, own, sequence=str(path.resolve()), lost_s=lost_s) for truth, own in stretches]
     if not runs:
-        raise log.source.fault(_why_none(log))
+        raise log.source.fault(why_none(log))
     of = f"{counted(len(runs), 'stretch', 'stretches')} of {sum(run.path_m for run in runs):.0f} m"
     notes = [
         f"truth: {log.fixes.track.name}, fixes, {log.fixes.track.rate_hz:.3g} Hz",
@@ -105,36 +94,6 @@ def read_runs(
     if not has_yaw:
         notes.append("headings: the vehicle's own, so no drift of heading is measured")
     return LoggedRuns(runs=tuple(runs), has_yaw=has_yaw, accuracy_m=log.fixes.accuracy_m, notes=(*notes, *log.notes))
-
-
-def _read(path: Path, vehicle: int | None, topic: str | None) -> LoggedOdometry:
-    suffix = path.suffix.lower()
-    if topic is not None and not log_bags.is_bag(path):
-        raise FlightError(f"{path.name} is no bag: leave out --topic")
-    if vehicle is not None and suffix != _TELEMETRY:
-        raise FlightError(f"{path.name} is no telemetry log: leave out --vehicle")
-    if log_bags.is_bag(path):
-        return log_bags.read_odometry(path, topic=topic)
-    if suffix == _TELEMETRY:
-        return log_telemetry.read_odometry(path, vehicle=vehicle)
-    if suffix not in _READERS:
-        suffixes = ", ".join((*_READERS, _TELEMETRY, *log_bags.BAGS))
-        raise FlightError(
-            f"{path.name or path} is no log with odometry that is read: {suffixes} are; trajectories in TUM files go "
-            "by --truth and --estimate"
-        )
-    return _READERS[suffix](path)
-
-
-def _why_none(log: LoggedOdometry) -> str:
-    """Return why no stretch is left."""
-    name, told = log.estimate.poses.name, log.estimate.fused
-    if not log.estimate.free_s:
-        return (
-            f"{name} fused GNSS from start to end ({told}): it is a copy of the truth, and no odometry; fly with a "
-            "receiver that is logged and not fused, or take a profile"
-        )
-    return f"{name} and {log.fixes.track.name} have no two moments in common while no GNSS was fused ({told})"
 
 
 def _stretches(log: LoggedOdometry) -> Iterator[tuple[Trajectory, Trajectory]]:
@@ -153,12 +112,8 @@ def _stretches(log: LoggedOdometry) -> Iterator[tuple[Trajectory, Trajectory]]:
         turned = level if log.attitudes is None else turned_at(log.attitudes, time_s)
         truth = _trajectory(time_s, np.column_stack([true_m[at], np.nan_to_num(up[at])]), turned)
         north, east, down = poses.at(time_s)[:, :3].T
-        own = turned_at(_quaternions(poses), time_s) if log.estimate.has_attitudes else turned
+        own = turned_at(quaternions_of(poses), time_s) if log.estimate.has_attitudes else turned
         yield truth, _trajectory(time_s, np.column_stack([east, north, -down]), own)
-
-
-def _quaternions(poses: Stream) -> Stream:
-    return Stream(name=poses.name, time_s=poses.time_s, values=poses.values[:, 3:])
 
 
 def _trajectory(time_s: Floats, position_m: Floats, of_ned: Rotation) -> Trajectory:

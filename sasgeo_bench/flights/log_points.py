@@ -41,6 +41,7 @@ _HIGHEST_ALTITUDE_M: Final = HIGHEST_M + 9_000.0  # above the highest ground
 _MOST_SHOWN: Final = 40  # characters of a text out of a file
 _ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
 _MOST_NAMES: Final = 12  # in a message
+_SPACED_ZONE: Final = re.compile(r"\s+(?=[-+]\d\d(?::?\d\d)?$)")  # ISO 8601 has no space before it
 _WGS84: Final = pyproj.Geod(ellps="WGS84")
 
 
@@ -79,7 +80,7 @@ class LogSource:
     def moment(self, text: str | None, number: int) -> float:
         """Return a time as ISO 8601 has it, in seconds since 1970; one without a zone is UTC."""
         try:
-            moment = dt.datetime.fromisoformat((text or "").strip())
+            moment = dt.datetime.fromisoformat(_SPACED_ZONE.sub("", (text or "").strip()))
         except ValueError as error:
             message = f"time is no date and time like 2025-05-01T10:00:00Z, {shown(text or '')}: mend it"
             raise self.fault(message, number) from error
@@ -91,6 +92,8 @@ class LogSource:
             raise FlightError(f"there is no flight log {self.path}: check the path")
         size = self.path.stat().st_size
         most = MOST_BYTES if most is None else most
+        if not size:
+            raise self.fault("empty: copy it anew, or export more")
         if size > most:
             raise self.fault(f"{size} bytes, at most {most} are read: cut the log first")
 
@@ -112,6 +115,8 @@ class FlightLog:
         Seconds since `start_s`, strictly increasing.
     start_s : float, optional
         Seconds since 1970, UTC, at `time_s` 0; None where the file does not say its zone.
+    clock_s : float, optional
+        Seconds of the log's own clock at `time_s` 0, which its other messages count by; None where it has no other.
     height_m : ndarray, shape (N,), optional
         Height above the ground or the place of take-off, metres; never one above the sea.
     altitude_m : ndarray, shape (N,), optional
@@ -128,6 +133,7 @@ class FlightLog:
     lat_deg: Floats
     time_s: Floats | None = None
     start_s: float | None = None
+    clock_s: float | None = None
     height_m: Floats | None = None
     altitude_m: Floats | None = None
     altitude_of: AltitudeOf = "unknown"
@@ -187,6 +193,7 @@ class FlightLog:
             lat_deg=columns["lat_deg"],
             **{name: columns.get(name) for name in ("time_s", "height_m", "altitude_m", *_ANGLES)},
             start_s=start_s,
+            clock_s=None,
             altitude_of=altitude_of,
             notes=notes,
         )
@@ -270,7 +277,8 @@ def _check_places(source: LogSource, numbers: Sequence[int], columns: Mapping[st
         numbers,
         (np.abs(lon) <= 180) & (np.abs(lat) <= 90),  # the globe
         lambda at: (
-            f"latitude {lat[at]:g}, longitude {lon[at]:g} are no degrees on Earth: mend them, or delete the point"
+            f"latitude {lat[at]:.9g}, longitude {lon[at]:.9g} are no degrees on Earth (-90 to 90, -180 to 180): mend "
+            "them, or delete the point"
         ),
     )
     text = "latitude and longitude are 0, which is no fix: delete the points without a fix"
@@ -375,6 +383,8 @@ def read_gpx(path: Path) -> FlightLog:
             elif name == "ele":
                 _add_altitude(lines[parent], element.text)
     kind, read = ("trk", track) if len(track) or not len(route) else ("rte", route)
+    if not len(read):
+        raise track.source.fault("holds no track or route: export that of the flight, or name the file by what it is")
     if counts[kind] > 1:
         raise track.source.fault(f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant")
     return read.log(altitude_of="unknown")
@@ -410,7 +420,9 @@ def read_kml(path: Path) -> FlightLog:
             _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())
             opened = ""
     if len(lines) != 1:
-        raise source.fault(f"{len(lines)} lines or tracks, one is read: keep the one that is meant")
+        none = "holds no line or track: export that of the flight, or name the file by what it is"
+        several = f"{len(lines)} lines or tracks, one is read: keep the one that is meant"
+        raise source.fault(several if lines else none)
     return lines[0].log(altitude_of="geoid", has_zone=has_zone)
 
 

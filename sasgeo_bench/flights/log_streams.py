@@ -25,7 +25,6 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 MOST_LOG_BYTES: Final = 2 * 2**30  # its readers keep no more than the streams they need
-LEAST_FIX: Final = 3  # of MAVLink, PX4 and ArduPilot alike: a place in three dimensions
 
 _MOST_APART_S: Final = 1.0  # from a fix to a height or an attitude that is its own
 _BEYOND_S: Final = 0.1  # two clocks of one computer agree so well
@@ -117,15 +116,21 @@ class Fixes:
         Messages without a fix.
     is_estimate : bool
         Whether an estimator gave them.
-    accuracy_m : float
-        Median of the horizontal accuracy that the receiver states, metres; NaN where it states none.
+    stated : Stream, optional
+        Horizontal accuracy that the receiver states, metres, shape (M, 1), at times of its own; None of one that states
+        none.
     """
 
     track: Stream
     altitude_of: AltitudeOf = "geoid"
     left_out: int = 0
     is_estimate: bool = False
-    accuracy_m: float = np.nan
+    stated: Stream | None = None
+
+    @property
+    def accuracy_m(self) -> float:
+        """Return the median of the horizontal accuracy that the receiver states, metres; NaN where it states none."""
+        return np.nan if self.stated is None else float(np.median(self.stated.values))
 
     @classmethod
     def of(
@@ -146,6 +151,12 @@ class Fixes:
         is_place &= (np.abs(table[:, 0]) <= 180) & (np.abs(table[:, 1]) <= 90) & np.isfinite(time_s) & is_fix
         track = Stream.of(source, name, np.asarray(time_s, dtype=np.float64)[is_place], table[is_place])
         return cls(track=track, left_out=int((~is_place).sum()), **others)  # type: ignore[arg-type]
+
+
+def stated_of(source: LogSource, name: str, time_s: Floats, accuracy_m: Floats) -> Stream | None:
+    """Return what a receiver states of its fixes, shape (N,), as a stream; None if it states nothing."""
+    is_stated = np.isfinite(accuracy_m) & (accuracy_m > 0)
+    return Stream.of(source, name, time_s[is_stated], accuracy_m[is_stated][:, None]) if is_stated.any() else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -212,11 +223,14 @@ class Estimate:
         From when to when no receiver was fused, seconds of the log's clock.
     fused : str
         What tells so, for messages: flags, or what kind of estimator it is.
+    resets_s : ndarray, shape (R,)
+        When the frame of the poses jumped, as the estimator itself counts it.
     """
 
     poses: Stream
     free_s: tuple[tuple[float, float], ...] = ((-np.inf, np.inf),)
     fused: str = "of a camera"
+    resets_s: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def has_attitudes(self) -> bool:
@@ -305,6 +319,16 @@ def free_stretches(flags: Sequence[tuple[Floats, Bools]]) -> tuple[tuple[float, 
         starts, ends = np.flatnonzero(steps < 0).tolist(), np.flatnonzero(steps > 0).tolist()
         found += [(float(part[at]), float(part[end - 1])) for at, end in zip(starts, ends, strict=True) if end - at > 1]
     return tuple(found)
+
+
+def resets_of(time_s: Floats, *counters: Floats) -> Floats:
+    """Return when any counter of resets, shape (N,) as the times, changed.
+
+    >>> resets_of(np.array([0.0, 0.1, 0.2]), np.array([3.0, 3.0, 4.0])).tolist()
+    [0.2]
+    """
+    changed = [np.append(False, np.diff(np.asarray(one, dtype=np.float64)) != 0) for one in counters]
+    return time_s[np.logical_or.reduce(changed)] if changed else np.empty(0)
 
 
 def quaternions_of_ned(w: Floats, x: Floats, y: Floats, z: Floats) -> Floats:
@@ -401,7 +425,7 @@ def flight_of(source: LogSource, streams: Streams) -> FlightLog:
     else:
         notes += streams.clock.notes()
         start_s = streams.clock.offset_s + float(time_s[0])
-    return FlightLog.of(
+    log = FlightLog.of(
         source,
         range(1, len(time_s) + 1),
         columns,
@@ -409,6 +433,7 @@ def flight_of(source: LogSource, streams: Streams) -> FlightLog:
         altitude_of=fixes.altitude_of,
         notes=(*notes, *streams.notes),
     )
+    return replace(log, clock_s=float(time_s[0]))
 
 
 def angles_at(attitudes: Stream, time_s: Floats) -> tuple[Floats, Floats, Floats]:

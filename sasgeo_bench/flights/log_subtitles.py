@@ -98,6 +98,10 @@ def read_srt(path: Path) -> Subtitles:
     source.check_count(len(blocks))
     if not blocks:
         raise source.fault("holds no subtitles (00:00:01,000 --> 00:00:02,000): name the drone's own file")
+    notes = []
+    if len(blocks) > 1 and blocks[-1].is_open and not blocks[-2].is_open:
+        notes.append("cut off: the file ends within a subtitle, and is read up to there")
+        del blocks[-1]
     placed = [block for block in blocks if block.place is not None]
     if not placed:
         raise source.fault(
@@ -111,7 +115,7 @@ def read_srt(path: Path) -> Subtitles:
         tell_left_out(source, len(placed) - len(fixed), "at 0, 0, where the drone had no fix")
     if len(placed) < len(blocks):
         tell_left_out(source, len(blocks) - len(placed), "without a place")
-    return _Columns.of(source, fixed).subtitles()
+    return _Columns.of(source, fixed, notes).subtitles()
 
 
 def _text(source: LogSource) -> str:
@@ -142,6 +146,7 @@ class _Block:
     gimbal_deg: tuple[float, float, float] | None = None  # yaw, pitch, roll
     body_deg: tuple[float, float, float] | None = None
     clock: dt.datetime | None = None
+    is_open: bool = False  # whether a bracket is not closed
 
 
 def _blocks(text: str) -> Iterator[_Block]:
@@ -181,6 +186,7 @@ def _block(number: int, time_s: float, text: str) -> _Block:
         gimbal_deg=_angles(values, "gb_") or _pry(calls.get("G.PRY")),
         body_deg=_angles(values, "") or _pry(calls.get("F.PRY")),
         clock=_clock(text),
+        is_open=any(text.count(begin) > text.count(end) for begin, end in ("[]", "()")),
     )
 
 
@@ -226,9 +232,8 @@ class _Columns:
     notes: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, source: LogSource, blocks: Sequence[_Block]) -> Self:
+    def of(cls, source: LogSource, blocks: Sequence[_Block], notes: list[str]) -> Self:
         """Return the columns of blocks with places; one that not all of them have is none, which is noted."""
-        notes: list[str] = []
         columns: dict[str, Floats] = {"time_s": np.array([block.time_s for block in blocks])}
         columns["lon_deg"], columns["lat_deg"] = _degrees(blocks, notes).T
         for name, keys in _KEYS.items():

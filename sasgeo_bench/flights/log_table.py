@@ -49,7 +49,7 @@ _DAY_TIME: Final = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)\s*(?:([AaP
 _WEEK: Final = re.compile(r"(\d{3,4}) +(\d+(?:\.\d+)?)")
 _SPAN: Final = re.compile(r"(?:(\d+)h\s*)?(?:(\d+)m\s*)?(\d+(?:\.\d+)?)s")
 _ZONE: Final = re.compile(r"\s*(?:UTC|GMT)(?=[-+]|$)")  # which a time is in without a word, too
-_ZONED: Final = re.compile(r"Z$|UTC|GMT|:\d\d(?:[.,]\d+)?\s*[-+]\d\d:?\d\d$")
+_ZONED: Final = re.compile(r"Z$|UTC|GMT|:\d\d(?:[.,]\d+)?\s*[-+]\d\d(?::?\d\d)?$")
 _DATED: Final = re.compile(r"\d{4}\D?\d{1,2}\D?\d{1,2}[T ]")  # of a moment, not a time of day
 _DATE: Final = re.compile(r"\d[-/.:]\d+[-/.:]\d|\dT\d")  # of a time that is no number, in any order
 
@@ -185,7 +185,7 @@ def _rows(source: LogSource) -> Iterator[tuple[int, list[str]]]:
                 is_begun = True
                 yield line, row
     except (OSError, UnicodeDecodeError) as error:
-        raise source.fault(f"no text in UTF-8 ({message_of(error)}): export it anew") from error
+        raise source.fault(f"no text in UTF-8 ({message_of(error)}): save it as CSV in UTF-8") from error
     except csv.Error as error:
         message = f"no sound CSV ({message_of(error)}): mend the line"
         raise source.fault(message, line + 1) from error

@@ -23,7 +23,6 @@ from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.flights.log_points import FlightLog, LogSource
 from sasgeo_bench.flights.log_streams import (
-    LEAST_FIX,
     MOST_LOG_BYTES,
     Clock,
     Estimate,
@@ -36,7 +35,10 @@ from sasgeo_bench.flights.log_streams import (
     library,
     quaternions_of_angles,
     quaternions_of_ned,
+    resets_of,
+    stated_of,
 )
+from sasgeo_bench.flights.log_units import LEAST_FIX
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, Floats]
@@ -44,6 +46,7 @@ Rows = dict[tuple[int, int, str], "array[float]"]  # by system, component and me
 
 SYSTEM_TIME: Final = "SYSTEM_TIME"
 GPS_RAW: Final = "GPS_RAW_INT"
+GPS_SECOND: Final = "GPS2_RAW"
 POSITION: Final = "GLOBAL_POSITION_INT"
 ATTITUDE: Final = "ATTITUDE"
 ODOMETRY: Final = "ODOMETRY"
@@ -75,10 +78,11 @@ class Telemetry:
 FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     SYSTEM_TIME: ("time_unix_usec", "time_boot_ms"),
     GPS_RAW: ("time_usec", "fix_type", "lat", "lon", "alt", "h_acc"),
+    GPS_SECOND: ("time_usec", "fix_type", "lat", "lon", "alt", "h_acc"),
     POSITION: ("time_boot_ms", "lat", "lon", "alt", "relative_alt"),
     ATTITUDE: ("time_boot_ms", "yaw", "pitch", "roll"),
-    ODOMETRY: ("time_usec", "estimator_type", "x", "y", "z", "q[0]", "q[1]", "q[2]", "q[3]"),
-    VISION: ("usec", "x", "y", "z", "roll", "pitch", "yaw"),
+    ODOMETRY: ("time_usec", "estimator_type", "x", "y", "z", "q[0]", "q[1]", "q[2]", "q[3]", "reset_counter"),
+    VISION: ("usec", "x", "y", "z", "roll", "pitch", "yaw", "reset_counter"),
 }
 _PLACES: Final = (GPS_RAW, POSITION)
 
@@ -251,20 +255,21 @@ def streams_of(telemetry: Telemetry) -> Streams:
 
 
 def _receivers(telemetry: Telemetry) -> list[Fixes]:
-    gps = telemetry.messages.get(GPS_RAW)
-    if gps is None:
-        return []
-    stated_m = gps["h_acc"][gps["h_acc"] > 0] / 1e3
-    places = (gps["lon"] / 1e7, gps["lat"] / 1e7, gps["alt"] / 1e3)
-    fixes = Fixes.of(
-        telemetry.source,
-        GPS_RAW,
-        _on_boot(telemetry.messages, gps["time_usec"] / 1e6, gps["received"]),
-        places,
-        gps["fix_type"] >= LEAST_FIX,
-        accuracy_m=float(np.median(stated_m)) if len(stated_m) else np.nan,
-    )
-    return [fixes]
+    source, found = telemetry.source, []
+    for name in (GPS_RAW, GPS_SECOND):
+        if (gps := telemetry.messages.get(name)) is None:
+            continue
+        time_s = _on_boot(telemetry.messages, gps["time_usec"] / 1e6, gps["received"])
+        places = (gps["lon"] / 1e7, gps["lat"] / 1e7, gps["alt"] / 1e3)
+        is_fix = gps["fix_type"] >= LEAST_FIX
+        stated = stated_of(source, name, time_s[is_fix], gps["h_acc"][is_fix] / 1e3)
+        found.append(Fixes.of(source, name, time_s, places, is_fix, stated=stated))
+    return found
+
+
+def read_receivers(path: Path, *, vehicle: int | None = None) -> list[Fixes]:
+    """Read the receivers of a vehicle, in the order in which one is taken for the truth."""
+    return _receivers(read_telemetry(path, vehicle=vehicle))
 
 
 def fixes_of(telemetry: Telemetry) -> tuple[Fixes, tuple[str, ...]]:
@@ -300,7 +305,8 @@ def estimates_of(telemetry: Telemetry) -> list[Estimate]:
         own_s = columns["time_usec" if name == ODOMETRY else "usec"] / 1e6
         time_s = _on_boot(telemetry.messages, own_s, columns["received"], is_own=False)
         poses = np.column_stack([columns["x"], columns["y"], columns["z"], turns])
-        found.append(Estimate(poses=Stream.of(telemetry.source, called, time_s, poses)))
+        stream = Stream.of(telemetry.source, called, time_s, poses)
+        found.append(Estimate(poses=stream, resets_s=resets_of(time_s, columns["reset_counter"])))
     if not found:
         why = f"{', '.join(refused)} may have fused GNSS" if refused else f"neither {ODOMETRY} nor {VISION} was sent"
         raise telemetry.source.fault(

@@ -19,7 +19,6 @@ from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.flights.log_points import FlightLog, LogSource
 from sasgeo_bench.flights.log_streams import (
-    LEAST_FIX,
     MOST_LOG_BYTES,
     Clock,
     Estimate,
@@ -33,14 +32,17 @@ from sasgeo_bench.flights.log_streams import (
     known_fields,
     library,
     quaternions_of_ned,
+    resets_of,
+    stated_of,
 )
+from sasgeo_bench.flights.log_units import LEAST_FIX
 
 Floats = NDArray[np.float64]
 Columns = Mapping[str, NDArray[Any]]
 
-_RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
+RECEIVERS: Final = ("vehicle_gps_position", "sensor_gps")
 _ESTIMATE: Final = "vehicle_global_position"
-PLACES: Final = (*_RECEIVERS, _ESTIMATE)
+PLACES: Final = (*RECEIVERS, _ESTIMATE)
 _LOCAL: Final = "vehicle_local_position"
 _HOME: Final = "home_position"
 _LANDED: Final = "vehicle_land_detected"
@@ -51,7 +53,7 @@ FUSING: Final = ("cs_gps", "cs_gnss_pos", "cs_gps_yaw", "cs_gnss_yaw", "cs_gnss_
 _FUSING_BITS: Final = (2, 22, 38, 44)  # https://docs.px4.io/main/en/msg_docs/EstimatorStatus
 _ATTITUDE: Final = "vehicle_attitude"
 TOPICS: Final = (*PLACES, _LOCAL, _HOME, _LANDED, _ATTITUDE)
-OF_DRIFT: Final = (*_RECEIVERS, _LOCAL, _ATTITUDE, VISUAL, *_FLAGS)
+OF_DRIFT: Final = (*RECEIVERS, _LOCAL, _ATTITUDE, VISUAL, *_FLAGS)
 _E7: Final = 1e7
 
 
@@ -141,12 +143,22 @@ def read_ulog(path: Path) -> FlightLog:
     return flight_of(topics.source, streams)
 
 
+def read_receivers(path: Path) -> list[Fixes]:
+    """Read the receivers of a ULog file, in the order in which one is taken for the truth."""
+    return receivers_of(read_topics(path, RECEIVERS))
+
+
+def receivers_of(topics: Topics) -> list[Fixes]:
+    """Return the receivers of a ULog file, in the order in which one is taken for the truth."""
+    with known_fields(topics.source):
+        return [_fixes(topics.source, *one) for name in RECEIVERS for one in topics.instances(name)]
+
+
 def fixes_of(topics: Topics) -> tuple[Fixes, tuple[str, ...]]:
     """Return the fixes of the first receiver that has two, else of the estimate, and a note on the others."""
-    source = topics.source
-    receivers = [_fixes(source, *one) for name in _RECEIVERS for one in topics.instances(name)]
+    source, receivers = topics.source, receivers_of(topics)
     estimates = [_estimated(source, *one) for one in topics.instances(_ESTIMATE)]
-    return first_with_fixes(source, [*receivers, *estimates], f"{', '.join(_RECEIVERS)} or {_ESTIMATE}")
+    return first_with_fixes(source, [*receivers, *estimates], f"{', '.join(RECEIVERS)} or {_ESTIMATE}")
 
 
 def streams_of(topics: Topics) -> Streams:
@@ -186,16 +198,10 @@ def _fixes(source: LogSource, name: str, columns: Columns) -> Fixes:
     else:
         lon, lat, alt = (np.asarray(columns[key], dtype=np.float64) for key in ("lon", "lat", "alt"))
         places = (lon / _E7, lat / _E7, alt / 1e3)
-    stated_m = np.asarray(columns.get("eph", np.empty(0)), dtype=np.float64)
-    is_fix = np.asarray(columns["fix_type"]) >= LEAST_FIX
-    return Fixes.of(source, name, seconds(columns), places, is_fix, accuracy_m=_median(stated_m, is_fix))
-
-
-def _median(values: Floats, is_fix: NDArray[np.bool_]) -> float:
-    """Return the median of what a receiver states of its fixes; NaN if it states nothing."""
-    stated = values[is_fix] if len(values) else values
-    stated = stated[np.isfinite(stated) & (stated > 0)]
-    return float(np.median(stated)) if len(stated) else np.nan
+    time_s, is_fix = seconds(columns), np.asarray(columns["fix_type"]) >= LEAST_FIX
+    accuracy_m = np.asarray(columns.get("eph", np.full(len(time_s), np.nan)), dtype=np.float64)
+    stated = stated_of(source, name, time_s[is_fix], accuracy_m[is_fix])
+    return Fixes.of(source, name, time_s, places, is_fix, stated=stated)
 
 
 def _estimated(source: LogSource, name: str, columns: Columns) -> Fixes:
@@ -237,7 +243,8 @@ def estimates_of(topics: Topics) -> list[Estimate]:
         keys = ["x", "y", "z"] if is_old else [f"position[{at}]" for at in range(3)]
         turns = quaternions_of_ned(*(columns[f"q[{at}]"] for at in range(4)))
         poses = np.column_stack([*(columns[key] for key in keys), turns])
-        found.append(Estimate(poses=Stream.of(topics.source, name, seconds(columns), poses)))
+        stream = Stream.of(topics.source, name, seconds(columns), poses)
+        found.append(Estimate(poses=stream, resets_s=_resets(columns, ("reset_counter",))))
     local = topics.first(_LOCAL)
     if found or local is None:
         return found
@@ -246,7 +253,12 @@ def estimates_of(topics: Topics) -> list[Estimate]:
     is_valid = np.asarray(columns.get("xy_valid", np.ones(len(columns["timestamp"]))), dtype=bool)
     poses = np.column_stack([columns[key] for key in ("x", "y", "z")])
     stream = Stream.of(topics.source, name, seconds(columns)[is_valid], poses[is_valid])
-    return [Estimate(poses=stream, free_s=free_s, fused=fused)]
+    resets_s = _resets(columns, ("xy_reset_counter",))
+    return [Estimate(poses=stream, free_s=free_s, fused=fused, resets_s=resets_s)]
+
+
+def _resets(columns: Columns, names: tuple[str, ...]) -> Floats:
+    return resets_of(seconds(columns), *(columns[name] for name in names if name in columns))
 
 
 def read_odometry(path: Path) -> LoggedOdometry:
@@ -287,7 +299,7 @@ def _without_receiver(topics: Topics) -> tuple[tuple[tuple[float, float], ...], 
 
 def _clock(topics: Topics, first: str) -> Clock | None:
     """Return UTC by the receiver that is read, else by another; `time_ref_utc` is an offset of the pilot's choice."""
-    receivers = dict(one for name in _RECEIVERS for one in topics.instances(name))
+    receivers = dict(one for name in RECEIVERS for one in topics.instances(name))
     for name in sorted(receivers, key=lambda name: name != first):
         utc_us = np.asarray(receivers[name].get("time_utc_usec", np.empty(0)), dtype=np.float64)
         is_known = utc_us > 0

@@ -20,6 +20,7 @@ SPEED_MPS: Final = 10.0  # of a log without times
 FASTEST_MPS: Final = 100.0  # between two points: no drone of this benchmark is faster
 LOWEST_M: Final = 5.0  # lower poses are of a drone that stands, takes off or lands
 HIGHEST_M: Final = 10_000.0
+LEAST_FIX: Final = 3  # of MAVLink, PX4 and ArduPilot alike: a place in three dimensions
 
 # Option of the program, as a field or argument in Python -> least and most.
 RANGES: Final = MappingProxyType(

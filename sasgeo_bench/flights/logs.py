@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import pyproj
@@ -19,6 +19,8 @@ from sasgeo_bench.core.errors import CameraError, FlightError
 from sasgeo_bench.core.folders import sha256_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import plain
+from sasgeo_bench.flights.drift_profile import DriftProfile, list_profiles, load_profile, read_drift_profile
+from sasgeo_bench.flights.gnss import SecondReceiver, second_receiver
 from sasgeo_bench.flights.log_bags import BAGS, is_bag, read_bag
 from sasgeo_bench.flights.log_dataflash import read_dataflash
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, read_gpx, read_kml, steps_m
@@ -27,6 +29,7 @@ from sasgeo_bench.flights.log_table import read_csv
 from sasgeo_bench.flights.log_telemetry import read_tlog
 from sasgeo_bench.flights.log_ulog import read_ulog
 from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
+from sasgeo_bench.flights.own_odometry import OwnOdometry, read_own
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory, read_tum
 from sasgeo_bench.geometry.grid import Grid
@@ -55,6 +58,8 @@ _TELEMETRY: Final = ".tlog"
 SUFFIXES: Final = (*_READERS, _TELEMETRY, *BAGS, *_TABLES, *_TUM)
 SHORTEST_FLOWN_M: Final = 200.0  # of a flight whose views are drawn: five or so
 _GROUND_CELL_M: Final = 10.0  # of heights of the ground
+OdometryOf = Literal["log", "drawn"]
+ODOMETRY_OF: Final = ("log", "drawn")
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones the place of the drone is unknown
 
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
@@ -85,8 +90,12 @@ def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | Non
         raise _meaningless(path, "has times", "--speed-mps")
     if height_m is None:
         return log
-    notes = (*log.notes, f"height: {height_m:g} m throughout, as --height says")
-    return replace(log, height_m=np.full(len(log), height_m), notes=notes)
+    heights_m, where = np.full(len(log), height_m), "throughout"
+    if log.height_m is not None and (is_flown := log.height_m >= LOWEST_M).any() and not is_flown.all():
+        # Where the log itself has the drone on the ground, it flew at no height that anyone says
+        heights_m, where = np.where(is_flown, height_m, log.height_m), f"where its own is {LOWEST_M:g} m at least"
+    notes = (*log.notes, f"height: {height_m:g} m {where}, as --height says")
+    return replace(log, height_m=heights_m, notes=notes)
 
 
 def read_places(path: Path, *, vehicle: int | None = None) -> Floats:
@@ -243,16 +252,28 @@ def _over(log: FlightLog | None, path: Path, region: Region, cut: _Cut) -> Traje
 
 @dataclass(frozen=True, kw_only=True)
 class FlownPath:
-    """The log of a flight that was flown, and what it does not say; `read_flight` says what each means."""
+    """The log of a flight that was flown, and what it does not say; `read_flight` says what each means.
+
+    `odometry` is that of the log where no receiver was fused into it, or `drawn` by a profile all the way; `topic` has
+    it in a bag whose messages do not say what they fused. `drift` names the profile by which it is drawn and its noise
+    is declared: one that comes with the package, or a file.
+    """
 
     file: Path
     facts: LogFacts = field(default_factory=LogFacts)
     height_m: float | None = None
     least_m: float = SHORTEST_FLOWN_M
+    odometry: OdometryOf = "log"
+    topic: str | None = None
+    drift: str | None = None
 
     def __post_init__(self) -> None:
         if not self.file.is_file() and not is_bag(self.file):
             raise FlightError(f"there is no flight log {self.file}: check the path")
+        if self.odometry not in ODOMETRY_OF:
+            raise FlightError(f"--odometry is one of {', '.join(ODOMETRY_OF)}, got {self.odometry!r}")
+        if self.topic is not None and (self.odometry == "drawn" or not is_bag(self.file)):
+            raise FlightError(f"--topic is of the odometry of a bag, and {self.file.name} gives none: leave it out")
 
     @cached_property
     def key(self) -> str:
@@ -260,6 +281,7 @@ class FlownPath:
         logs = sorted(self.file.iterdir()) if self.file.is_dir() else [self.file]
         files = [*map(sha256_of, logs), None if self.facts.dem is None else sha256_of(self.facts.dem)]
         asked = [*files, self.file.name, asdict(self.facts) | {"dem": None}, self.height_m, self.least_m]
+        asked += [self.odometry, self.topic, None if self.profile is None else self.profile.model_dump()]
         return hashlib.sha256(json.dumps(asked).encode()).hexdigest()
 
     @cached_property
@@ -271,6 +293,29 @@ class FlownPath:
     def start_s(self) -> float | None:
         """When the log begins, seconds since 1970, UTC; None where it does not tell."""
         return None if self.log is None else self.log.start_s
+
+    @cached_property
+    def profile(self) -> DriftProfile | None:
+        """The profile of drift that `drift` names; None where it names none."""
+        if self.drift is None or self.drift in list_profiles():
+            return None if self.drift is None else load_profile(self.drift)
+        return read_drift_profile(Path(self.drift))
+
+    def own_odometry(self) -> OwnOdometry:
+        """Return the log's own odometry; raise `FlightError` that says why it has none that fused no GNSS."""
+        if self.odometry == "drawn":
+            raise FlightError("--odometry drawn says so")
+        if self.log is None:
+            raise FlightError(f"{self.file.name} has poses, and no odometry beside them")
+        if self.log.yaw_deg is None and self.log.clock_s is not None:
+            raise FlightError(f"{self.file.name} has no attitudes, so that its heading is that of its course")
+        return read_own(self.file, clock_s=self.log.clock_s or 0.0, vehicle=self.facts.vehicle, topic=self.topic)
+
+    def second_receiver(self) -> SecondReceiver:
+        """Return a weaker receiver of the log beside that of the truth; raise `FlightError` that says why none is."""
+        if self.log is None or self.log.clock_s is None:
+            raise FlightError(f"{self.file.name} has no second receiver")
+        return second_receiver(self.file, clock_s=self.log.clock_s, vehicle=self.facts.vehicle)
 
     def over(self, region: Region, *, margin_m: float) -> Trajectory:
         """Return the longest stretch over a region, as `read_flight` does."""
@@ -286,9 +331,20 @@ def _check_near(log: FlightLog, path: Path, region: Region) -> None:
         message = (
             f"{path.name} lies elsewhere, at latitude {lat.min():.4f} to {lat.max():.4f}, longitude {lon.min():.4f} to "
             f"{lon.max():.4f} degrees, and {region.manifest.id} at latitude {south:.4f} to {north:.4f}, longitude "
-            f"{west:.4f} to {east:.4f}: take another region"
+            f"{west:.4f} to {east:.4f}: take another region{_hint(log, region)}"
         )
         raise FlightError(plain(message))
+
+
+def _hint(log: FlightLog, region: Region) -> str:
+    """Return what a log beside a region may have wrong, if the middle of its points lies on it otherwise."""
+    west, south, east, north = region.manifest.bounds_lonlat
+    lon, lat = float(np.median(log.lon_deg)), float(np.median(log.lat_deg))
+    if west <= lat <= east and south <= lon <= north:
+        return ", or mend the log, whose longitude and latitude seem to be swapped"
+    if west <= math.degrees(lon) <= east and south <= math.degrees(lat) <= north:
+        return ", or say --place-unit rad, as its places seem to be in radians"
+    return ""
 
 
 def _above_ground(log: FlightLog, path: Path, en_m: Floats, manifest: Manifest, facts: LogFacts) -> Floats | None:

@@ -134,6 +134,7 @@ Belief = Literal["honest", "optimistic"]
 
 LOST_M: Final = 1e4  # standard deviations of a lost increment
 LOST_DEG: Final = 180.0
+_LOST: Final = np.diag([LOST_M**2, LOST_M**2, LOST_DEG**2])
 _FLOOR_M: Final = 1e-3  # believed of any increment, drifting or not, so that a covariance can be inverted
 _FLOOR_DEG: Final = 1e-3
 _SCALE_M: Final = 100.0  # distance at which a profile gives its drift of heading
@@ -247,7 +248,7 @@ def draw_odometry(
     believed = _Law(profile=profile, steps_m=np.abs(moved))
     # 3: an optimistic odometer believes a third of its standard deviations
     covariance = believed.covariance(moved, drift.resets) / (3.0**2 if belief == "optimistic" else 1.0)
-    covariance[is_lost] = np.diag([LOST_M**2, LOST_M**2, LOST_DEG**2])
+    covariance[is_lost] = _LOST
     yaw_deg = wrap_deg(wrap_deg(np.diff(flown.yaw_deg)) + np.degrees(drift.turn_rad) + drift.jump_deg)
     return Odometry(
         right_m=np.where(is_lost, 0.0, moved.real),
@@ -268,6 +269,101 @@ def _draw_lost(steps_m: Floats, profile: DriftProfile, rng: np.random.Generator)
     np.add.at(edges, first, 1)
     np.add.at(edges, after, -1)
     return np.asarray(np.cumsum(edges[:-1]) > 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoggedSteps:
+    """What the odometer of a log says of the N - 1 steps between N moments of a flight, in its own metres.
+
+    Parameters
+    ----------
+    right_m, up_m : ndarray, shape (N - 1,)
+        Displacement in the axes of the pose before, as of `Odometry`; any number where it says nothing.
+    yaw_deg : ndarray, shape (N - 1,)
+        Turn, clockwise, degrees; NaN of an odometer without headings of its own.
+    is_logged : ndarray of bool, shape (N - 1,)
+        Whether the log has odometry of the step: no receiver was fused, and the odometer ran.
+    is_lost : ndarray of bool, shape (N - 1,)
+        Of those that are logged, where the odometer was silent or began anew.
+    """
+
+    right_m: Floats
+    up_m: Floats
+    yaw_deg: Floats
+    is_logged: Bools
+    is_lost: Bools
+
+    def over(self, drawn: Odometry, profile: DriftProfile, *, belief: Belief = "honest") -> Odometry:
+        """Return odometry that is the log's where it has some, and elsewhere that which was drawn.
+
+        Parameters
+        ----------
+        drawn : Odometry
+            By a profile, of the same steps. Its turns stay where the log's odometer has no headings of its own: those
+            of the vehicle are the truth's, and would be turns without an error.
+        profile : DriftProfile
+            The noise that the odometer declares of each step.
+        belief : {"honest", "optimistic"}
+            As `draw_odometry` takes it.
+
+        Returns
+        -------
+        Odometry
+            Its covariances are the profile's law over the way that the odometer took itself to go, never what was
+            measured against the receiver on this flight: the receiver is the truth, and an odometer that knows how far
+            it is off in this very hour has looked at it. So they may be too small, or too large, for this drone.
+
+        Examples
+        --------
+        An odometer that is 2 % long on the first of two steps, and silent on the other:
+
+        >>> from sasgeo_bench.flights.drift_profile import load_profile
+        >>> flown = Trajectory.of_angles(
+        ...     time_s=[0.0, 5.0, 10.0], position_m=[[0, 0, 80], [0, 50, 80], [0, 100, 80]], yaw_deg=[0.0, 0.0, 0.0]
+        ... )
+        >>> profile = load_profile("perfect")
+        >>> drawn = draw_odometry(flown, profile, rng=np.random.default_rng(0))
+        >>> own = LoggedSteps(
+        ...     right_m=np.zeros(2),
+        ...     up_m=np.array([51.0, np.nan]),
+        ...     yaw_deg=np.zeros(2),
+        ...     is_logged=np.array([True, False]),
+        ...     is_lost=np.zeros(2, dtype=bool),
+        ... )
+        >>> own.over(drawn, profile).up_m.tolist()
+        [51.0, 50.0]
+        """
+        moved = np.where(self.is_logged & ~self.is_lost, self.right_m + 1j * self.up_m, 0.0)
+        law = _Law(profile=profile, steps_m=np.abs(moved))
+        # 3: as of what is drawn
+        declared = law.covariance(moved, np.zeros(len(moved), dtype=np.int64)) / (
+            3.0**2 if belief == "optimistic" else 1.0
+        )
+        declared[self.is_lost] = _LOST
+        turned = np.where(np.isfinite(self.yaw_deg), self.yaw_deg, drawn.yaw_deg)
+        is_lost = np.where(self.is_logged, self.is_lost, drawn.is_lost)
+        return Odometry(
+            right_m=np.where(self.is_logged, moved.real, drawn.right_m),
+            up_m=np.where(self.is_logged, moved.imag, drawn.up_m),
+            yaw_deg=np.where(is_lost, 0.0, np.where(self.is_logged, turned, drawn.yaw_deg)),
+            covariance=np.where(self.is_logged[:, None, None], declared, drawn.covariance),
+            is_lost=is_lost,
+        )
+
+    def off(self, flown: Trajectory) -> tuple[float, float]:
+        """Return the medians of how far the log's steps are off a flight: percent of the way, and degrees.
+
+        NaN where no step is compared; steps of less than a metre are not.
+        """
+        true, is_told = _true_steps(flown), self.is_logged & ~self.is_lost
+        is_way = is_told & (np.abs(true) > 1.0)
+        off_pct = _PERCENT * np.abs(self.right_m + 1j * self.up_m - true)[is_way] / np.abs(true)[is_way]
+        off_deg = np.abs(wrap_deg(self.yaw_deg - np.diff(flown.yaw_deg)))[is_told & np.isfinite(self.yaw_deg)]
+        return _median(off_pct), _median(off_deg)
+
+
+def _median(values: Floats) -> float:
+    return float(np.median(values)) if len(values) else math.nan
 
 
 def dead_reckon(flown: Trajectory, steps: Odometry) -> Trajectory:

@@ -137,7 +137,8 @@ def departures(
     """
     fixes = flight.fixes if has_all else flight.accepted
     if not fixes:
-        raise ConfigError(f"none of {counted(len(flight.fixes), 'fix', 'fixes')} is accepted: --all takes them as well")
+        none_of = f"none of {counted(len(flight.fixes), 'fix', 'fixes')} is accepted"
+        raise ConfigError(f"{none_of}: --all takes them (a file, or --as gps_input)")
     found: list[Departure] = []
     resets, next_s = 0, -math.inf
     for fix in fixes:

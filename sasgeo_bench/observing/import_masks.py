@@ -16,7 +16,14 @@ from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.observing.import_photos import ImportRequest, Perceived, table_of, view_cells, write_tasks
 from sasgeo_bench.observing.masks import MASKS, Legend, Strange, read_coco, read_mask
-from sasgeo_bench.observing.pictures import OwnPicture, cell_of_view_m, largest_square, open_picture, resized
+from sasgeo_bench.observing.pictures import (
+    ARCHIVES,
+    OwnPicture,
+    cell_of_view_m,
+    largest_square,
+    open_picture,
+    resized,
+)
 from sasgeo_bench.observing.posed_pictures import (
     PosedPicture,
     PosedPictures,
@@ -159,6 +166,8 @@ class _Masks:
                     raise ConfigError(f"{path.name} names {plain(name)} and another picture of that name: rename one")
                 coco[_key(name)] = seen
             return cls(legend=legend, strange=strange, files={}, coco=coco)
+        if path.suffix.lower() in ARCHIVES:
+            raise ConfigError(f"{path} is an archive: unpack it and name the folder")
         if not path.is_dir():
             raise ConfigError(f"{path} is no folder of masks, nor a COCO file (*.json): check the path")
         files: dict[str, Path] = {}

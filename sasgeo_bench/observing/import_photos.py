@@ -126,6 +126,10 @@ class ImportRequest:
             )
         if self.sigma_m is not None and not 0 < self.sigma_m <= 100:
             raise ConfigError(f"--sigma lies above 0 and within 100 m, got {self.sigma_m!r}")
+        if self.group.is_gnss:
+            raise ConfigError(
+                f"--prior {self.group.name} is of drawn flights: for pictures take r50 or r100, as in r50-weak-s3"
+            )
         if self.log is not None and self.poses is not None:
             raise ConfigError("poses come from one source: give --poses or --track alone")
         if self.seed < 0:
@@ -188,13 +192,12 @@ def write_tasks(
             return ""
         if off_m[one.name] == 0:
             return f"whose view is not wholly on the map {state.region}"
-        return f"that were taken {nearest} or more beside the map {state.region}"
+        return f"that were taken {nearest} or more beside the map {state.region} (name another --region)"
 
-    swapped = any(one.name in off_m and _is_swapped(one, manifest) for one in found.pictures)
+    hint = next((hint for one in found.pictures if one.name in off_m and (hint := _hint(one, manifest))), "")
     found.leave_out(away)
     _tell(found)
     if not found.pictures:
-        hint = "; longitude and latitude seem to be swapped" if swapped else ""
         raise _nothing(request.pictures, found.left_out, hint)
     writer = TaskWriter(request=request, manifest=manifest, state=state, perceive=perceive)
     tasks = [writer.put(request.name, partial(writer.views, found.pictures), found.pictures)]
@@ -265,11 +268,15 @@ def _by_number(name: str) -> list[list[tuple[str, int]]]:
     return [[(text, int(digits or -1)) for text, digits in part] for part in parts]
 
 
-def _is_swapped(one: PosedPicture, manifest: Manifest) -> bool:
-    """Return whether a picture off the map lies on it with its longitude and latitude swapped."""
+def _hint(one: PosedPicture, manifest: Manifest) -> str:
+    """Return what a picture off the map may have wrong, if it lies on the map otherwise."""
     west, south, east, north = manifest.bounds_lonlat
-    lat_deg, lon_deg = one.picture.lonlat or (math.nan, math.nan)
-    return west <= lon_deg <= east and south <= lat_deg <= north
+    lon_deg, lat_deg = one.picture.lonlat or (math.nan, math.nan)
+    if west <= lat_deg <= east and south <= lon_deg <= north:
+        return "; longitude and latitude seem to be swapped"
+    if west <= math.degrees(lon_deg) <= east and south <= math.degrees(lat_deg) <= north:
+        return "; places seem to be in radians: call the columns lat_rad and lon_rad"
+    return ""
 
 
 def _tell(found: PosedPictures) -> None:
@@ -318,7 +325,7 @@ class TaskWriter:
     def tell_failed(self) -> None:
         """Tell which pictures could not be decoded, and why."""
         for why, names in self.failed_by.items():
-            tell(f"left out: {named(names, 'picture')} {why}")
+            tell(f"left out: {named(sorted(names), 'picture')} {why}")
 
     def put(self, suite: str, pairs: Callable[[str], Pairs], of: Sequence[PosedPicture], more: str = "") -> Task:
         """Write one task; `more` is a sentence on what it is."""

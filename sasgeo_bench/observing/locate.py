@@ -382,8 +382,7 @@ class _Asker:
             note="; ".join(filter(None, [picture.note, unlike])),
         )
         if answer.status != "ok":
-            why = one_line(f"{self._request.matcher}: {answer.status}: {answer.message}")
-            return replace(known, status="failed", reason=why)
+            return replace(known, status="failed", reason=fault_of(self._request.matcher, answer))
         if not answer.candidates:
             return replace(known, reason="nothing that the map knows is seen", p_false=1.0)
         view = answer.candidates[0][0]
@@ -439,6 +438,16 @@ def _told(told: Told) -> dict[str, float | str]:
     said = asdict(replace(told, dem=None))
     del said["dem"]
     return said | ({} if told.dem is None else {"dem": _content(told.dem)})
+
+
+def fault_of(matcher: str, answer: Prediction) -> str:
+    """Return why a matcher gave no answer, in a line, and the mend of a search that took too long.
+
+    >>> fault_of("sasgeo", Prediction(query_id="a", status="timeout", message="no answer within 30 s"))
+    'sasgeo: timeout: no answer within 30 s: search less, by --near and --radius or by --heading'
+    """
+    mend = ": search less, by --near and --radius or by --heading" if answer.status == "timeout" else ""
+    return one_line(f"{matcher}: {answer.status}: {answer.message}") + mend
 
 
 def prior_of_view(prior: Prior, middle_m: tuple[float, float]) -> Prior:

@@ -165,8 +165,9 @@ def read_mask(path: Path, legend: Legend, strange: Strange | None = None) -> Seg
     Parameters
     ----------
     path : Path
-        PNG (palettes count as indices; 1 to 16 bits as stored), GeoTIFF, or an array of numpy: (H, W) of values,
-        (C, H, W) of probabilities, or an archive with an array of probabilities for each name of `bands`.
+        PNG or GeoTIFF (1 to 16 bits as stored; palettes count as indices, for a legend of colours as these), or an
+        array of numpy: (H, W) of values, (C, H, W) of probabilities, or an archive with an array of probabilities for
+        each name of `bands`.
     legend : Legend
         What its values, colours or bands mean.
     strange : Strange, optional
@@ -202,6 +203,8 @@ def read_mask(path: Path, legend: Legend, strange: Strange | None = None) -> Seg
                 raise ImageError(f"{path.name} has {source.width} x {source.height} pixels: cut it first")
             bands, colours = source.read(), source.colorinterp
             nodata, names = source.nodata, source.descriptions
+            if legend.colours and colours == (ColorInterp.palette,):
+                bands, colours = _painted(bands[0], source.colormap(1)), _RGBA
     except (RasterioError, OSError) as error:
         if isinstance(error, ImageError):
             raise
@@ -222,6 +225,16 @@ def _opened(path: Path) -> Iterator[rasterio.io.DatasetReader]:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)  # where it lies is in a table of poses
         with open_png(path) if path.suffix.lower() == ".png" else open_geotiff(path) as source:
             yield source
+
+
+_RGBA: Final = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
+
+
+def _painted(values: NDArray[Any], palette: Mapping[int, tuple[int, ...]]) -> NDArray[np.uint8]:
+    """Return indices as the colours of their palette, shape (4, H, W); those that it lacks are transparent."""
+    table = np.zeros((65536, 4), dtype=np.uint8)
+    table[list(palette)] = list(palette.values())
+    return np.moveaxis(table[values], -1, 0)
 
 
 def _of_values(

@@ -30,7 +30,7 @@ Clock = Literal["utc", "local", "own"]
 PitchZero = Literal["down", "horizon"]
 
 FLIGHT_LOG: Final = "flight log"  # the kind of a table whose rows are the photos themselves, joined by time
-STRAIGHT_DOWN: Final = "a column gimbal_pitch of -90 says straight down"
+STRAIGHT_DOWN: Final = "say --poses: a column gimbal_pitch of -90 says straight down"
 FARTHEST_M: Final = 50_000.0  # of a row from the median of all: no battery lasts so long
 SWAPPED: Final = "whose longitude and latitude are swapped"
 _LEVEL_DEG: Final = 85.0  # of tilt: a camera that leans more shows the horizon

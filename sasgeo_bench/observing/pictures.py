@@ -41,6 +41,7 @@ LEAST_M: Final = 16.0  # of a smaller view nothing can be said
 FINEST_M: Final = 0.25  # pixels on the ground; finer ones are averaged
 STEEPEST_DEG: Final = 60.0  # of tilt: beyond it the ground of a view is far and coarse
 SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff")
+ARCHIVES: Final = (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar")
 _UNREAD: Final = frozenset(  # pictures and videos that drones and telephones write
     {".dng", ".heic", ".heif", ".raw", ".arw", ".cr2", ".nef", ".bmp", ".gif", ".jxl", ".avif", *VIDEOS}
 )
@@ -196,7 +197,7 @@ def list_pictures(path: Path, *, is_told: bool = True) -> list[Path]:
         return found
     if not path.is_file():
         raise ImageError(f"there is no picture or folder {path}: check the path")
-    if path.suffix.lower() in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"):
+    if path.suffix.lower() in ARCHIVES:
         raise ImageError(f"{path} is an archive: unpack it and name the folder")
     return [path]
 

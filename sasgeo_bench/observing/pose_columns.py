@@ -167,7 +167,7 @@ _DEGREES: Final = re.compile(  # capitals alone are sides: "s" are seconds
     r"\s*(?P<last>[NSEW])?"
 )
 _MOMENT: Final = re.compile(
-    r"(\d{4})[-:/.](\d\d)[-:/.](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:[.,](\d+))?\s*(Z|UTC|GMT|[-+]\d\d:?\d\d)?"
+    r"(\d{4})[-:/.](\d\d)[-:/.](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:[.,](\d+))?\s*(Z|UTC|GMT|[-+]\d\d(?::?\d\d)?)?"
 )
 _PLAIN_UNIT: Final = re.compile(r"[\[(](?:decimal )?(?:degrees?|units?)[\])]", re.IGNORECASE)
 _LETTERS: Final = MappingProxyType({"longitude": "EW", "latitude": "NS"})
@@ -713,9 +713,9 @@ def _moment(columns: _Columns, row: Sequence[str]) -> tuple[float | None, Clock]
     key = key_of(columns.sheet.header[column.at].rpartition(":")[2])
     is_utc = zone in ("Z", "UTC", "GMT") or "utc" in key or key == "gpsdate_time"
     seconds = whole.timestamp() + float(f"0.{parts or 0}")
-    shift = re.fullmatch(r"([-+])(\d\d):?(\d\d)", zone)
+    shift = re.fullmatch(r"([-+])(\d\d)(?::?(\d\d))?", zone)
     if shift:
-        ahead_s = (int(shift[2]) * 60 + int(shift[3])) * 60
+        ahead_s = (int(shift[2]) * 60 + int(shift[3] or 0)) * 60
         return seconds - (ahead_s if shift[1] == "+" else -ahead_s), "utc"
     return seconds, "utc" if is_utc else "local"
 

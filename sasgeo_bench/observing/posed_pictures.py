@@ -3,6 +3,7 @@
 
 import datetime as dt
 import math
+import re
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +21,7 @@ from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.geometry.projection import to_grid
+from sasgeo_bench.geometry.projection import WGS84, to_grid
 from sasgeo_bench.observing.picture_poses import STRAIGHT_DOWN, PicturePose, PoseTable, picture_heading_deg
 from sasgeo_bench.observing.pictures import (
     LEAST_M,
@@ -43,6 +44,7 @@ GPS_SIGMA_M: Final = 3.3  # of one axis: 95 % within 8 m, as the GPS performance
 _TILT_SIGMA: Final = 0.0175  # metres to a metre of height: a gimbal is right to a degree
 _SAME_SHAPE: Final = 0.01  # by which the aspects of a picture and of a smaller copy differ, from rounding
 _NADIR_DEG: Final = 5.0  # of tilt: a camera that leans less looks straight down, but for the wind
+_FINE_M: Final = 0.5  # of a standard deviation, below which the datum of a place counts: plates move by 0.02 m a year
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,6 +177,8 @@ def pose_pictures(
     found.notes += [f"{note} ({counted(count, 'picture')})" for note, count in headings.items()]
     found.notes += _clocks(seen)
     found.notes += _passed_over(heights, found.pictures)
+    seen = _in_one_zone(seen, found)
+    found.notes += _datums(seen)
     ground = _ground(heights, seen, epsg, found) if seen else None
     for stand in seen:
         posed = _posed(stand, heights, ground)
@@ -187,12 +191,15 @@ def pose_pictures(
 
 
 def reason_of(error: SasgeoError, path: Path) -> str:
-    """Return the text of an error without the path or name of its picture, so that like faults are counted together.
+    """Return the text of an error without the name of its picture or mask, so that like faults are counted together.
 
-    >>> reason_of(ImageError("photos/a.jpg is no JPEG"), Path("photos/a.jpg"))
+    >>> reason_of(ImageError("photos/1.jpg is no JPEG"), Path("photos/1.jpg"))
     'it is no JPEG'
+    >>> reason_of(ImageError("most of what 1.png holds is 1.5"), Path("photos/1.jpg"))
+    'most of what it holds is 1.5'
     """
-    return plain(str(error)).replace(plain(str(path)), "it").replace(plain(path.name), "it")[:160]
+    text = plain(str(error)).replace(plain(str(path)), "it").replace(plain(path.name), "it")
+    return re.sub(rf"(?<!\w){re.escape(plain(path.stem))}\.[A-Za-z]\w*", "it", text)[:160]
 
 
 def is_georeferenced(path: Path) -> bool:
@@ -236,6 +243,7 @@ class _Stand:
     sigma_m: float
     epsg: int
     heading_note: str = ""
+    zone_s: float = 0.0  # by which the clock is ahead of UTC, where it must be known
 
     @property
     def altitude(self) -> tuple[float | None, str]:
@@ -247,6 +255,10 @@ class _Stand:
     def exif_s(self) -> float | None:
         taken = self.photo.taken_at
         return None if taken is None else taken.replace(tzinfo=dt.UTC).timestamp()
+
+    @property
+    def taken_s(self) -> float | None:
+        return None if self.exif_s is None else self.exif_s - self.zone_s
 
     @property
     def height_m(self) -> float | None:
@@ -288,7 +300,7 @@ def _stand(
     if photo.place_fault:
         return f"with a position {photo.place_fault}: convert it"
     if photo.lon_deg is None or photo.lat_deg is None:
-        return "without a position"
+        return "without a position (say --poses or --track, or copy the drone's own files)"
     if photo.gimbal is None:
         return f"without angles of the camera ({hint})"
     place_m = to_grid(photo.lon_deg, photo.lat_deg, epsg)[:2] if row is None else row.in_crs(epsg)
@@ -358,6 +370,33 @@ def _passed_over(heights: Heights, georeferenced: Sequence[PosedPicture]) -> lis
     return [f"heights are passed over of {counted(len(georeferenced), 'georeferenced picture')}: each tells its size"]
 
 
+def _datums(seen: Sequence[_Stand]) -> list[str]:
+    """Return a line where places are so good that it counts by which datum they are, and none says so."""
+    fine = [stand for stand in seen if stand.sigma_m < _FINE_M and (stand.row is None or stand.row.epsg == WGS84)]
+    if not fine:
+        return []
+    good = f"places of {counted(len(fine), 'picture')} are good to less than {_FINE_M:g} m, and taken as WGS 84"
+    return [
+        f"{good} of the day: a network in ETRS89, NAD83 or GDA2020 lies up to 2 m off, say its CRS by --poses, --epsg"
+    ]
+
+
+def _in_one_zone(seen: Sequence[_Stand], found: PosedPictures) -> list[_Stand]:
+    """Return photos whose clocks go together, in UTC where they are of several zones, and say so."""
+    counts = Counter(stand.photo.utc_offset for stand in seen if stand.photo.taken_at is not None)
+    if len(counts) < 2:
+        return list(seen)
+    if None in counts:
+        found.notes.append(
+            f"clocks: {counts[None]} of {counted(counts.total(), 'photo')} state no zone (EXIF's OffsetTimeOriginal): "
+            "all are taken to be of one"
+        )
+        return list(seen)
+    found.notes.append(f"clocks: photos of {len(counts)} zones, whose times are taken in UTC")
+    offsets_s = [0.0 if stand.photo.utc_offset is None else stand.photo.utc_offset.total_seconds() for stand in seen]
+    return [replace(stand, zone_s=zone_s) for stand, zone_s in zip(seen, offsets_s, strict=True)]
+
+
 def _ground(heights: Heights, seen: Sequence[_Stand], epsg: int, found: PosedPictures) -> Dem | None:
     """Read the heights of the ground around all cameras, and say what they count from."""
     if heights.dem is None:
@@ -410,7 +449,7 @@ def _posed(stand: _Stand, heights: Heights, dem: Dem | None) -> PosedPicture | s
         sigma_m=round(sigma_m, 2),
         position_m=(camera.east_m, camera.north_m, camera.height_m),
         side_m=side_m,
-        time_s=row.time_s if row is not None and row.time_s is not None else stand.exif_s,
+        time_s=row.time_s if row is not None and row.time_s is not None else stand.taken_s,
         lens=f"{photo.model or 'camera'} {photo.width_px} x {photo.height_px}",
         is_turned=photo.orientation != 1,
     )

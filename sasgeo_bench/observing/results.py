@@ -121,8 +121,7 @@ class _Map:
             step = grid.rows / overview.shape[1]
             ends = (math.floor(row / step), math.floor(col / step), math.ceil(rows / step), math.ceil(cols / step))
             layers = overview[:, ends[0] : ends[0] + ends[2], ends[1] : ends[1] + ends[3]]
-        colours = paint_overview(self.manifest, pooled(layers, most_cells=_MAP_PX))
-        return _bytes(colours), part.bounds_m
+        return paint_overview(self.manifest, pooled(layers, most_cells=_MAP_PX)), part.bounds_m
 
     def _window(self, corners_m: NDArray[np.float64]) -> tuple[int, int, int, int]:
         grid = self.manifest.grid

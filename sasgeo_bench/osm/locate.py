@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find a dated extract by file name and SHA-256 in the given folders, else download it."""
+"""What a region file says of an extract or map, and the file itself: in the given folders, else downloaded."""
 
 import datetime as dt
 import os
@@ -17,6 +17,7 @@ from pydantic import (
     Field,
     SerializerFunctionWrapHandler,
     StringConstraints,
+    field_validator,
     model_serializer,
     model_validator,
 )
@@ -25,6 +26,7 @@ from sasgeo_bench.core.config import Document, Line
 from sasgeo_bench.core.errors import ExtractError
 from sasgeo_bench.core.folders import scratch_folder, sha256_of
 from sasgeo_bench.core.progress import QUIET
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
 IMAGERY_VARIABLE: Final = "SASGEO_IMAGERY"
@@ -99,6 +101,63 @@ class Extract(Document):
         if bool(self.sha256) == (self.town is not None):
             raise ValueError(f"extract {self.file!r} needs either sha256 = [...] or town = {{...}}")
         return self
+
+
+class ClassTable(Document):
+    r"""Which rows of a file of features are of which class of the map: all of one `class`, or by a `column`.
+
+    `values` says which class each value of the column is; rows with other values are left out and counted. `layer` is
+    needed where the file has several, `epsg` where it says no coordinate reference system. `width_column` holds the
+    widths of lines in metres; without it they are as wide as the class usually is.
+
+    >>> from sasgeo_bench.core.config import parse_toml
+    >>> text = 'column = "use"\nvalues = { house = "building", shed = "building", pond = "water" }'
+    >>> parse_toml(text, ClassTable, source="[[own_map]]").named_classes
+    ('building', 'water')
+    """
+
+    layer: Line | None = None
+    class_name: str | None = Field(default=None, alias="class")
+    column: Line | None = None
+    values: dict[Line, str] = {}
+    width_column: Line | None = None
+    epsg: int | None = None
+
+    @field_validator("epsg")
+    @classmethod
+    def _epsg_is_known(cls, epsg: int | None) -> int | None:
+        import pyproj  # noqa: PLC0415 - a process of a matcher reads no map of one's own, and starts without it
+
+        try:
+            return epsg if epsg is None or pyproj.CRS.from_epsg(epsg) else None
+        except pyproj.exceptions.CRSError as error:
+            raise ValueError(f"epsg {epsg!r} is unknown: name the one of its coordinates") from error
+
+    @model_validator(mode="after")
+    def _says_classes_once(self) -> Self:
+        if (self.column is None) != (not self.values) or (self.column and self.class_name):
+            raise ValueError(
+                "say which class its features are by class = '...', or by column = '...' and a table of its values, "
+                "values = { house = 'building' }"
+            )
+        named_ones = [name for name in (self.class_name, *self.values.values()) if name is not None]
+        if not named_ones and (self.layer or self.width_column or self.epsg):
+            raise ValueError("layer, width_column and epsg are of maps with `class`, or `column` and `values`: add one")
+        known = load_taxonomy().names
+        strange = next((name for name in named_ones if name not in known), None)
+        if strange is not None:
+            raise ValueError(f"its features are {strange!r}, which is no class: there are {', '.join(known)}")
+        return self
+
+    @property
+    def named_classes(self) -> tuple[str, ...]:
+        """Return the classes that it names, in the order of their ids; none where properties are tags."""
+        found = {self.class_name, *self.values.values()}
+        return tuple(name for name in load_taxonomy().names if name in found)
+
+    def class_of(self, value: str) -> str | None:
+        """Return the class of a feature with a value in the column, as text; None if it is none."""
+        return self.class_name or self.values.get(value)
 
 
 def extract_folders(given: Sequence[Path] = ()) -> tuple[Path, ...]:

@@ -22,12 +22,12 @@ from sasgeo_bench.osm.coverage import FULL_SHARE, LONGEST_M, M_PER_DEG, choose_c
 from sasgeo_bench.osm.families import missing_families
 from sasgeo_bench.osm.features import DTYPES, SEA, check_features, make_features
 from sasgeo_bench.osm.geojson import classless, scan_geojson
-from sasgeo_bench.osm.locate import CoverageSource
+from sasgeo_bench.osm.locate import ClassTable, CoverageSource
 from sasgeo_bench.osm.mapped import Mapped, box_text, find_shore, lonlat_box, map_ground, project
-from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Scan, ScanRow, Traits, scan_file
+from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Scan, ScanRow, Traits, joined_wkb, scan_file
 from sasgeo_bench.osm.snapshot import Snapshot, elements, open_snapshot, own_id
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
-from sasgeo_bench.osm.vector import ClassTable, scan_vector
+from sasgeo_bench.osm.vector import scan_vector
 
 # Lines with the trait "through" lead somewhere: where they end at the edge of the data, the extract was cut there. Of
 # 191 extracts with a box, those cut along a border have 2 to 11 such ends beyond the estimated area, or more than 0.38
@@ -58,7 +58,8 @@ def cuts_by_box(path: Path, scan: Scan, objects: Geometries) -> Callable[[shapel
             return shapely.transform(geometry, lambda lonlat: (lonlat - [west, south]) * scale)
 
         things, box, area = flat(objects), flat(header), flat(found)
-        if _ends_inside(_through_ways(path, flat), things, area, box):
+        lines, ends = (flat(shapes) for shapes in _through_ways(path))
+        if _ends_inside(lines, ends, things, area=area, box=box):
             return False
         coast = flat(shapely.from_wkb(np.array(scan.coast, dtype=object)))
         sea = shapely.union_all(find_shore(coast, box).sea)
@@ -72,33 +73,30 @@ def cuts_by_box(path: Path, scan: Scan, objects: Geometries) -> Callable[[shapel
     return is_cut
 
 
-def _through_ways(path: Path, flat: Callable[[Any], Any]) -> list[tuple[shapely.Geometry, list[shapely.Point]]]:
-    """Return open ways of the classes that lead somewhere, each with the ends at which it should meet another."""
+def _through_ways(path: Path) -> tuple[Geometries, Geometries]:
+    """Return open ways of the classes that lead somewhere, and the ends at which they should meet others, degrees."""
     taxonomy = load_taxonomy()
     rules = [rule for name in taxonomy.having("through") for rule in taxonomy[name].rules if rule.geometry == "line"]
     wanted = osmium.filter.TagFilter(*((rule.key, value) for rule in rules for value in (*rule.widths, *rule.values)))  # noqa: PD011 - of a rule, not of a frame
     ways = osmium.FileProcessor(str(path)).with_locations()
-    found = []
+    found, is_stream = [], []
     for way in elements(ways.with_filter(osmium.filter.EntityFilter(osmium.osm.WAY)).with_filter(wanted)):
-        places = [(node.lon, node.lat) for node in way.nodes if node.location.valid()]
-        if way.is_closed() or len(set(places)) < 2:  # no line
-            continue
-        ends = places[-1:] if "waterway" in way.tags else [places[0], places[-1]]  # streams begin anywhere
-        found.append((flat(shapely.LineString(places)), [flat(shapely.Point(place)) for place in ends]))
-    return found
+        wkb = None if way.is_closed() else joined_wkb(way)
+        if wkb is not None:
+            found.append(wkb)
+            is_stream.append("waterway" in way.tags)
+    lines = np.asarray(shapely.from_wkb(np.array(found, dtype=object)), dtype=object)
+    starts = shapely.get_point(lines[~np.array(is_stream, dtype=bool)], 0)  # streams begin anywhere
+    return lines, np.concatenate([starts, shapely.get_point(lines, -1)])
 
 
 def _ends_inside(
-    ways: list[tuple[shapely.Geometry, list[shapely.Point]]],
-    objects: Geometries,
-    area: shapely.Geometry,
-    box: shapely.Geometry,
+    lines: Geometries, ends: Geometries, objects: Geometries, *, area: shapely.Geometry, box: shapely.Geometry
 ) -> bool:
     """Return whether lines that lead somewhere end at the edge of the data instead, far from the sides of the box."""
-    if not ways:
+    if not len(lines):
         return False
-    crossings = int(shapely.intersects(np.array([line for line, _ in ways]), shapely.boundary(box)).sum())
-    ends = np.array([end for _, of_way in ways for end in of_way], dtype=object)
+    crossings = int(shapely.intersects(lines, shapely.boundary(box)).sum())
     ends = ends[shapely.contains(box, ends) & (shapely.distance(ends, shapely.boundary(box)) > LONGEST_M)]
     ends = ends[(shapely.distance(ends, shapely.boundary(area)) <= LONGEST_M) | ~shapely.intersects(ends, area)]
     end, _ = overlapping(ends, objects, predicate="intersects")

@@ -267,6 +267,18 @@ def line_wkb(way: Any, tally: Tally) -> bytes | None:  # noqa: ANN401
     return bytes(shapely.to_wkb(shapely.multilinestrings([shapely.linestrings(piece) for piece in pieces])))
 
 
+def joined_wkb(way: Any) -> bytes | None:  # noqa: ANN401
+    """Return the WKB of a way straight over its gaps, closed if the way is; None of fewer than two different nodes."""
+    try:
+        return bytes.fromhex(_FACTORY.create_linestring(way))
+    except osmium.InvalidLocationError:
+        places = [(node.lon, node.lat) for node in way.nodes if node.location.valid()]
+    except RuntimeError:  # osmium's geometry_error: fewer than two different points
+        return None
+    places += places[:1] if way.is_closed() and places and places[0] != places[-1] else []
+    return bytes(shapely.to_wkb(shapely.linestrings(places))) if len(set(places)) > 1 else None
+
+
 def _pieces(way: Any, tally: Tally) -> list[list[tuple[float, float]]]:  # noqa: ANN401
     """Return runs of at least two present nodes, as longitude and latitude; count nodes at impossible places."""
     impossible = sum(not node.location.valid() and node.location.x != _NOWHERE for node in way.nodes)
@@ -476,10 +488,7 @@ class _LostPass:
         if wkb is None or wkb[1] == SEVERAL_LINES:
             marks = scan.gaps if is_cut or (is_lost and labels) else self.gaps
             marks[way.id] = find_gaps(way)
-            # Line through the nodes that are there, closed if the way is: an area goes on across a gap
-            places = [(node.lon, node.lat) for node in way.nodes if node.location.valid()]
-            places += places[:1] if way.is_closed() and places and places[0] != places[-1] else []
-            wkb = bytes(shapely.to_wkb(shapely.linestrings(places))) if len(set(places)) > 1 else None
+            wkb = joined_wkb(way)  # an area goes on across a gap
         if wkb is None:
             return
         line = self.lines[way.id] = shapely.from_wkb(wkb)

@@ -10,15 +10,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyproj
 import shapely
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_validator
 
-from sasgeo_bench.core.config import Document, Line
 from sasgeo_bench.core.errors import CoverageError, ExtractError, StoreError, counted, named
 from sasgeo_bench.core.parquet import MOST_VALUES, VERIFIED, open_table, read_schema
 from sasgeo_bench.core.paths import plain_file
@@ -26,9 +24,10 @@ from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.projection import WGS84, to_lonlat
 from sasgeo_bench.osm.geojson import NO_TIME, features_of, shape_of
+from sasgeo_bench.osm.locate import ClassTable
 from sasgeo_bench.osm.mapped import lonlat_box
 from sasgeo_bench.osm.scan import Box, Classifier, Scan, ScanRow
-from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
+from sasgeo_bench.osm.taxonomy import Label, Taxonomy
 
 MOST_FEATURES: Final = 2_000_000  # in a region
 MOST_UNPACKED: Final = 2_000_000_000  # bytes of a file that is read whole: an archive, a GeoParquet
@@ -46,61 +45,6 @@ _AREA: Final = 2  # dimensions
 
 Geometries = NDArray[np.object_]
 Points = NDArray[np.float64]
-
-
-class ClassTable(Document):
-    r"""Which rows of a file of features are of which class of the map: all of one `class`, or by a `column`.
-
-    `values` says which class each value of the column is; rows with other values are left out and counted. `layer` is
-    needed where the file has several, `epsg` where it says no coordinate reference system. `width_column` holds the
-    widths of lines in metres; without it they are as wide as the class usually is.
-
-    >>> from sasgeo_bench.core.config import parse_toml
-    >>> text = 'column = "use"\nvalues = { house = "building", shed = "building", pond = "water" }'
-    >>> parse_toml(text, ClassTable, source="[[own_map]]").named_classes
-    ('building', 'water')
-    """
-
-    layer: Line | None = None
-    class_name: str | None = Field(default=None, alias="class")
-    column: Line | None = None
-    values: dict[Line, str] = {}
-    width_column: Line | None = None
-    epsg: int | None = None
-
-    @field_validator("epsg")
-    @classmethod
-    def _epsg_is_known(cls, epsg: int | None) -> int | None:
-        try:
-            return epsg if epsg is None or pyproj.CRS.from_epsg(epsg) else None
-        except pyproj.exceptions.CRSError as error:
-            raise ValueError(f"epsg {epsg!r} is unknown: name the one of its coordinates") from error
-
-    @model_validator(mode="after")
-    def _says_classes_once(self) -> Self:
-        if (self.column is None) != (not self.values) or (self.column and self.class_name):
-            raise ValueError(
-                "say which class its features are by class = '...', or by column = '...' and a table of its values, "
-                "values = { house = 'building' }"
-            )
-        named_ones = [name for name in (self.class_name, *self.values.values()) if name is not None]
-        if not named_ones and (self.layer or self.width_column or self.epsg):
-            raise ValueError("layer, width_column and epsg are of maps with `class`, or `column` and `values`: add one")
-        known = load_taxonomy().names
-        strange = next((name for name in named_ones if name not in known), None)
-        if strange is not None:
-            raise ValueError(f"its features are {strange!r}, which is no class: there are {', '.join(known)}")
-        return self
-
-    @property
-    def named_classes(self) -> tuple[str, ...]:
-        """Return the classes that it names, in the order of their ids; none where properties are tags."""
-        found = {self.class_name, *self.values.values()}
-        return tuple(name for name in load_taxonomy().names if name in found)
-
-    def class_of(self, value: str) -> str | None:
-        """Return the class of a feature with a value in the column, as text; None if it is none."""
-        return self.class_name or self.values.get(value)
 
 
 class VectorScan(NamedTuple):

@@ -44,21 +44,21 @@ def pooled(layers: NDArray[np.uint8], *, most_cells: int) -> NDArray[np.uint8]:
     return np.where(is_there, np.uint8(PRESENT), parts.max(axis=(2, 4)))
 
 
-def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the colours of a map, shape (rows, cols, 3), 0..1."""
+def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the colours of a map, red, green and blue, shape (rows, cols, 3)."""
     rows, cols = overview.shape[1:]
-    picture = np.empty((rows, cols, 3))
-    picture[:] = rgb_of(GROUND)
-    colours = {item.name: rgb_of(item.colour) for item in load_taxonomy().classes}
+    number = np.zeros((rows, cols), dtype=np.uint8)  # of a colour
+    colours = [GROUND]
     for name in PAINT_ORDER:
         if name in manifest.classes:
-            picture[overview[manifest.classes.index(name)] == PRESENT] = colours[name]
-    outside = overview[0] == OUTSIDE
+            number[overview[manifest.classes.index(name)] == PRESENT] = len(colours)
+            colours.append(load_taxonomy()[name].colour)
     down, right = np.indices((rows, cols), sparse=True)
     is_stripe = (down + right) // _STRIPE_CELLS % 2 == 0
-    picture[outside] = rgb_of(UNMAPPED[0])
-    picture[outside & is_stripe] = rgb_of(UNMAPPED[1])
-    return picture
+    outside = overview[0] == OUTSIDE
+    number[outside] = (len(colours) + is_stripe)[outside]
+    palette = np.rint(255 * np.array([rgb_of(colour) for colour in (*colours, *UNMAPPED)]))
+    return np.asarray(palette.astype(np.uint8)[number])
 
 
 def paint_evidence(evidence: Evidence) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Final
 
+import cv2
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
@@ -91,7 +92,10 @@ def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
     side_m = (cols * _cell_m(manifest, overview), rows * _cell_m(manifest, overview))
     west_m, _, _, north_m = manifest.bounds_m
     extent = (west_m, west_m + side_m[0], north_m - side_m[1], north_m)  # what fills no whole cell lies south and east
-    chart.imshow(paint_overview(manifest, overview), extent=extent, interpolation="antialiased")
+    # With an alpha of its own matplotlib draws it in a third of the memory
+    picture = cv2.cvtColor(paint_overview(manifest, overview), cv2.COLOR_RGB2RGBA)
+    is_smaller = max(rows, cols) > _MAP_INCHES * _DPI
+    chart.imshow(picture, extent=extent, interpolation="antialiased" if is_smaller else "nearest")
     chart.set_anchor("NW")
     west, south, east, north = manifest.bounds_m
     frame = shapely.boundary(shapely.box(west, south, east, north))

@@ -23,9 +23,8 @@ from sasgeo_bench.core.config import (
 from sasgeo_bench.core.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
-from sasgeo_bench.osm.locate import Extract, PlainName, Sha256
+from sasgeo_bench.osm.locate import ClassTable, Extract, PlainName, Sha256
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.osm.vector import ClassTable
 from sasgeo_bench.regions.imagery import ImageryEntry
 from sasgeo_bench.regions.region import LICENCE, Provenance
 
@@ -472,14 +471,13 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
     >>> find_region_file("vadus")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
+    sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions or new-region)
     """
-    own = OWN_FOLDER / f"{id_or_path}.toml"
 
     def known() -> dict[str, Path]:
-        return ({id_or_path: own} if own.is_file() else {}) | list_region_files(folders=folders)
+        return {path.stem: path for path in sorted(OWN_FOLDER.glob("*.toml"))} | list_region_files(folders=folders)
 
-    return find_document(id_or_path, "region", "list regions shows all", known)
+    return find_document(id_or_path, "region", "list regions or new-region", known)
 
 
 def region_text(

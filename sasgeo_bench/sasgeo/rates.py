@@ -14,6 +14,7 @@ from scipy import special
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT
+from sasgeo_bench.search.field import round_kernel
 
 RINGS_M: Final = (4.0, 8.0, 12.0)  # around a class: OSM and masks of views are off by some metres each
 FAR: Final = len(RINGS_M) + 1
@@ -24,6 +25,7 @@ _YEARLY: Final = ("vanish_per_year", "appear_per_year")
 _CELLS_PER_WITNESS: Final = 200.0  # a house or a piece of road is right or wrong as a whole
 _EDGE: Final = 1e-5  # least distance of probabilities from 0 and 1
 _SLACK_M: Final = 1e-3  # tolerance of a distance at the edge of a ring
+_WIDE: Final = 16.0  # cells: to mark all cells around a class takes longer than to measure how far they are
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,10 +107,15 @@ def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.ui
     """Return the ring of each cell around the marked ones, shape (rows, cols)."""
     if not is_there.any():
         return np.full(is_there.shape, FAR, dtype=np.uint8)
-    distance = cv2.distanceTransform((~is_there).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    beyond = np.zeros(is_there.shape, dtype=np.uint8)
-    for edge_m in (0.0, *RINGS_M):
-        beyond += distance > (edge_m + _SLACK_M) / cell_size_m  # m: tolerance of a distance at the edge of a ring
+    reaches = [(edge_m + _SLACK_M) / cell_size_m for edge_m in RINGS_M]
+    beyond = (~is_there).astype(np.uint8)
+    if reaches[-1] > _WIDE:
+        distance = cv2.distanceTransform(beyond, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        for reach in reaches:
+            beyond += distance > reach
+        return beyond
+    for reach in reaches:
+        beyond += np.asarray(cv2.dilate(is_there.view(np.uint8), round_kernel(reach))) == 0
     return beyond
 
 

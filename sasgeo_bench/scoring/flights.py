@@ -5,7 +5,7 @@ A flight is the unit of all figures: its views are answered one after the other,
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Final, NamedTuple
@@ -182,7 +182,7 @@ def score_flights(
         row = {name: getattr(head, name) for name in _OF_HEAD} | {name: getattr(truth, name) for name in _OF_TRUTH}
         row |= {name: float(np.mean([getattr(one, name) for one in known])) for name in _MEANS}
         row |= {"place": place, "country": (country_of or {}).get(place, place), "cell_size_m": head.cell_size_m}
-        figures = flight_score(part, [head.increment for head in asked[first:last]])
+        figures = flight_score(part)
         rows.append(
             row
             | {"query_id": head.sequence_id, "pool": 0, "alias_index": None, "is_present": True, "ceiling": 1.0}
@@ -216,7 +216,7 @@ VIEW_COLUMNS: Final = (
     *("query_id", "sequence_id", "frame", "track", "suite", "region", "prior_group", "status"),
     *("distance_m", "time_s", "is_seen", "is_present", "is_carried", "is_answered", "is_accepted", "latency_s"),
     *("true_east_m", "true_north_m", "true_yaw_deg", "east_m", "north_m", "yaw_deg", "error_m", "yaw_error_deg"),
-    *("nees", "is_inside", "block", "place"),
+    *("nees", "is_inside", "increment", "block", "place"),
 )
 
 
@@ -229,7 +229,8 @@ def view_frame(
     """Return a row for each view of flights, in order, with the columns `VIEW_COLUMNS`.
 
     `truths` are those of `heads`, in the same order. Errors are infinite and places NaN without an estimate. `nees` is
-    infinite and `is_inside` False without a covariance, or with one without an inverse. `is_carried` marks the first
+    infinite and `is_inside` False without a covariance, or with one without an inverse. `increment` is what the
+    odometer says of the way to the view (`Step`). `is_carried` marks the first
     view after the drone was carried. The estimate of a method that does not say whether it is accepted is accepted.
     """
     answers = [predictions.get(head.query_id) for head in heads]
@@ -268,6 +269,7 @@ def view_frame(
         "yaw_error_deg": np.where(is_answered, np.abs(gaps[:, 2]), np.inf),
         "nees": nees,
         "is_inside": in_plane <= _INSIDE,
+        "increment": [head.increment for head in heads],
         "block": [truth.block for truth in truths],
         "place": [places.get(truth.block, base_of(head.region)) for truth, head in zip(truths, heads, strict=True)],
     }
@@ -297,8 +299,8 @@ def _normalized(gaps: Floats, covariances: Sequence[tuple[float, ...] | None]) -
     return nees / SIDE, in_plane
 
 
-def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, float] | None]) -> FlightScore:
-    """Return the figures of one flight from the rows of its views and the odometer's increments to them."""
+def flight_score(views: pd.DataFrame) -> FlightScore:
+    """Return the figures of one flight from the rows of its views."""
     column = {name: views[name].to_numpy() for name in VIEW_COLUMNS}
     distance_m, error_m = column["distance_m"].astype(float), column["error_m"].astype(float)
     accepted = column["is_accepted"].astype(bool)
@@ -309,8 +311,8 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
     per_km = 1000.0 / length_m if length_m > 0 else 0.0  # of a flight that never moved
     first_fix_m = _first(distance_m - distance_m[0], right)
     event = _event(column["is_seen"] & column["is_present"], column["is_carried"])
-    reckoned, answered = _Reckoned.of(views, increments), column["is_answered"].astype(bool)
-    confirmed = reckoned.confirmed()
+    reckoned, answered = _Reckoned.of(views), column["is_answered"].astype(bool)
+    confirmed = reckoned.confirmed(AGREEING, FIX_M)
     nees = float(column["nees"][answered].mean()) if answered.any() else math.inf
     time_s = column["time_s"].astype(float)
     return FlightScore(
@@ -453,11 +455,45 @@ def share_within(views: pd.DataFrame, within_m: float, within_deg: float) -> dic
     `views` are rows of `view_frame`; an error equal to a limit is within it.
     """
     is_near = (views["error_m"] <= within_m) & (views["yaw_error_deg"] <= within_deg)
-    names, distance_m = views["sequence_id"].tolist(), views["distance_m"].to_numpy(float)
     return {
-        names[first]: _share(_ways_m(distance_m[first:last]), is_near.to_numpy(bool)[first:last])
-        for first, last in pairwise(_ends(names))
+        name: _share(_ways_m(part["distance_m"].to_numpy(float)), part["is_near"].to_numpy(bool))
+        for name, part in flights_in(views.assign(is_near=is_near))
     }
+
+
+def flights_in(views: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Yield the views of each flight, out of rows of `view_frame`, with the id of the flight."""
+    names = views["sequence_id"].tolist()
+    for first, last in pairwise(_ends(names)):
+        yield names[first], views.iloc[first:last]
+
+
+def available_by_flight(views: pd.DataFrame, age_s: float) -> dict[str, float]:
+    """Return `availability` by flight, of accepted fixes; `views` are rows of `view_frame`."""
+    return {name: availability(*_accepted_at(part), age_s) for name, part in flights_in(views)}
+
+
+def continuous_by_flight(views: pd.DataFrame, holds_s: float) -> dict[str, float]:
+    """Return `continuity` by flight, of accepted fixes that are 30 s old at most; `views` are rows of `view_frame`."""
+    return {name: continuity(*_accepted_at(part), FRESH_S, holds_s) for name, part in flights_in(views)}
+
+
+def _accepted_at(views: pd.DataFrame) -> tuple[Floats, Bools]:
+    return views["time_s"].to_numpy(float), views["is_accepted"].to_numpy(bool)
+
+
+def confirmed_by_flight(views: pd.DataFrame, *, count: int, near_m: float, is_false: bool) -> dict[str, float]:
+    """Return by flight what a rule of `count` accepted fixes in a row gives that agree within `near_m` metres.
+
+    It is the share of its views with a confirmed fix within 25 m, or of its confirmed fixes that are beyond
+    (`is_false`), 0 where none is confirmed. `views` are rows of `view_frame`.
+    """
+    found = {}
+    for name, part in flights_in(views):
+        confirmed, is_right = _Reckoned.of(part).confirmed(count, near_m), part["error_m"].to_numpy(float) <= FIX_M
+        beyond = float((confirmed & ~is_right).sum() / max(1, confirmed.sum()))
+        found[name] = beyond if is_false else float((confirmed & is_right).mean())
+    return found
 
 
 def _event(is_sighted: Bools, is_carried: Bools) -> int | None:
@@ -500,8 +536,9 @@ class _Reckoned:
     turn: Floats  # radians
 
     @classmethod
-    def of(cls, views: pd.DataFrame, increments: Sequence[tuple[float, float, float] | None]) -> "_Reckoned":
-        """Add up the increments; a lost one counts as no movement."""
+    def of(cls, views: pd.DataFrame) -> "_Reckoned":
+        """Add up the increments to the views of one flight; a lost one counts as no movement."""
+        increments = views["increment"].tolist()
         steps = np.array([(0.0, 0.0, 0.0) if one is None else one for one in increments], dtype=float)
         way_m = reckon((0.0, 0.0), 0.0, steps[1:])
         column = {name: views[name].to_numpy(float) for name in ("true_east_m", "true_north_m", "east_m", "north_m")}
@@ -530,20 +567,20 @@ class _Reckoned:
         off = np.abs(self.true[first] + (self.way[last] - self.way[first]) * turned - self.true[last])
         return min(1.0, float(np.mean(off / (self.distance_m[last] - self.distance_m[first]))))
 
-    def confirmed(self) -> Bools:
-        """Return which views have an accepted fix that the ones before confirm: `AGREEING` in a row agree.
+    def confirmed(self, count: int, near_m: float) -> Bools:
+        """Return which views have an accepted fix that the ones before confirm: so many in a row agree.
 
-        Two agree if the odometer, which knows nothing of being carried, leads from the first to within 25 m of the
-        second. It cannot where it lost its way.
+        Two agree if the odometer, which knows nothing of being carried, leads from the first to within some metres of
+        the second. It cannot where it lost its way.
         """
         at = np.flatnonzero(self.accepted)
         first, second = at[:-1], at[1:]
         turned = np.exp(-1j * (self.fix_yaw[first] - self.turn[first]))
         off_m = np.abs(self.fixes[first] + (self.way[second] - self.way[first]) * turned - self.fixes[second])
         steps = np.cumsum(self.has_step)
-        agree = (off_m <= FIX_M) & (steps[second] - steps[first] == second - first)
+        agree = (off_m <= near_m) & (steps[second] - steps[first] == second - first)
         found = np.zeros(len(self.accepted), dtype=bool)
-        in_a_row = AGREEING - 1
+        in_a_row = count - 1
         if len(agree) >= in_a_row:
             found[at[in_a_row:]] = np.convolve(agree, np.ones(in_a_row), "valid") == in_a_row
         return found

@@ -5,7 +5,7 @@ import difflib
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
 from functools import partial
 from typing import Annotated, Final, Literal, NamedTuple
@@ -14,9 +14,9 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.core.errors import ConfigError
-from sasgeo_bench.scoring.base import Floats
+from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.cost import latencies_s
-from sasgeo_bench.scoring.flights import share_within
+from sasgeo_bench.scoring.flights import available_by_flight, confirmed_by_flight, continuous_by_flight, share_within
 from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, REJECTOR, TRACK, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import Interval
 from sasgeo_bench.scoring.metric import MeanMetric, Metric, QuantileMetric, ThresholdMetric
@@ -46,6 +46,9 @@ _LIMIT: Final = re.compile(rf"\s*{_NUMBER}\s*(m|deg)\s*")
 _SHARE_WITHIN: Final = re.compile(rf"{_NUMBER}\s*%\s*within\s+(.+)")
 _LATENCY: Final = re.compile(rf"p{_NUMBER}\s+latency\s+{_NUMBER}\s*(ms|s)")
 _FIGURE: Final = re.compile(rf"([a-z][\w.]*)\s*(<=|>=)\s*{_NUMBER}\s*(\S*)")
+_OF_FLIGHTS: Final = re.compile(
+    rf"(available|continuity)_{_NUMBER}s|(right_confirmed|false_of_confirmed)_([2-9]|[1-9][0-9])x{_NUMBER}m"
+)
 _UNITS: Final = {"": ("1", 1), "%": ("1", 100), "ms": ("s", 1000)}  # as written -> of the metric, and how many make one
 _EXAMPLES: Final = (
     "'80% within 50 m', '50% within 5 m and 2 deg', 'p95 latency 400 ms', 'false <= 1%', or a metric as in "
@@ -149,6 +152,42 @@ def latency_metrics(within_s: float) -> tuple[OwnMetric, ...]:
     return OwnMetric(usual), OwnMetric(flown, partial(_views_in_time, within_s=within_s))
 
 
+def flown_metric(name: str) -> OwnMetric | None:
+    """Return a metric of flights whose name holds constants of one's own; None for any other name.
+
+    `available_45s` asks for fixes that are 45 s old at most, `continuity_120s` for one all along the next 120 s (of 30
+    s at most), `right_confirmed_5x10m` and `false_of_confirmed_5x10m` for 5 accepted fixes in a row that agree within
+    10 m.
+
+    >>> found = [flown_metric(name) for name in ("available_45s", "right_confirmed_5x10m", "available_long")]
+    >>> [own and own.metric.name for own in found]
+    ['available_45s', 'right_confirmed_5x10m', None]
+    """
+    match = _OF_FLIGHTS.fullmatch(name)
+    if match is None or not float(match[2] or match[5]) > 0:
+        return None
+    kind, seconds, count, metres = match[1] or match[3], match[2], match[4], match[5]
+    of_views: Callable[[pd.DataFrame], Mapping[str, float]]
+    if kind == "available":
+        like, says = "available_30s", f"with fixes that are {seconds} s old at most"
+        of_views = partial(available_by_flight, age_s=float(seconds))
+    elif kind == "continuity":
+        like, says = "continuity_60s", f"over the next {seconds} s; shorter flights are not counted"
+        of_views = partial(continuous_by_flight, holds_s=float(seconds))
+    else:
+        like, says = kind, f"confirmed by {count} accepted ones in a row that agree within {metres} m"
+        is_false = kind == "false_of_confirmed"
+        of_views = partial(confirmed_by_flight, count=int(count), near_m=float(metres), is_false=is_false)
+    shipped = _SHIPPED[like]
+    assert isinstance(shipped, MeanMetric)  # noqa: S101 - by their table
+    values, counts = partial(_read, name=name), partial(_is_known, name=name)
+    return OwnMetric(replace(shipped, name=name, meaning=f"As {like}, {says}", values=values, counts=counts), of_views)
+
+
+def _is_known(scores: pd.DataFrame, name: str) -> Bools:
+    return scores[_key(name)].notna().to_numpy(bool)
+
+
 def is_latency(name: str) -> bool:
     """Return whether a metric of that name is one of `latency_metrics`."""
     return name.startswith(_IN_TIME)
@@ -246,6 +285,8 @@ def _requirement(text: str) -> Requirement:
         figures = {LOCALIZATION: within_name(within_m, within_deg), SEQUENCE: _flown_name(within_m, within_deg)}
         return Requirement(text=text, bound=_share(match[1], what), is_least=True, figures=figures, own=own)
     if (match := _LATENCY.fullmatch(text)) is not None:
+        if not float(match[2]) > 0:
+            raise ConfigError(f"{what}: no answer comes within {match[2]} {match[3]}, give a time above 0")
         own = latency_metrics(_divided(match[2], 1000 if match[3] == "ms" else 1))
         figures = dict.fromkeys(TRACKS, own[0].metric.name)
         return Requirement(text=text, bound=_share(match[1], what), is_least=True, figures=figures, own=own)
@@ -254,7 +295,8 @@ def _requirement(text: str) -> Requirement:
     name, is_least, unit = match[1], match[2] == ">=", match[4]
     if name == "false" and not is_least and unit == "%":
         return _of_false(text, _share(match[3], what))
-    metric = _SHIPPED.get(name)
+    own_one = None if name in _SHIPPED else flown_metric(name)
+    metric = _SHIPPED.get(name) if own_one is None else own_one.metric
     if not isinstance(metric, MeanMetric | QuantileMetric | ThresholdMetric):
         near = difflib.get_close_matches(name, _SHIPPED, n=1)
         known = f"did you mean {near[0]!r}?" if metric is None and near else f"say it as in {_EXAMPLES}"
@@ -271,7 +313,8 @@ def _requirement(text: str) -> Requirement:
             f"{what}, and {name} lies within {least:g} and {most:g}: give a bound that it may keep or miss"
         )
     tracks = metric.tracks if isinstance(metric, MeanMetric) else _tracks_of(metric)
-    return Requirement(text=text, bound=bound, is_least=is_least, figures=dict.fromkeys(tracks, name))
+    own = () if own_one is None else (own_one,)
+    return Requirement(text=text, bound=bound, is_least=is_least, figures=dict.fromkeys(tracks, name), own=own)
 
 
 def _tracks_of(metric: QuantileMetric | ThresholdMetric) -> tuple[str, ...]:

@@ -3,7 +3,6 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import product
 from threading import Lock
@@ -17,7 +16,7 @@ from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, normalize_deg
 from sasgeo_bench.search.field import FULL, Field, Level, Levels, Template, between, pooled, warped
-from sasgeo_bench.search.plan import Disc, Mode, Null, Tile, Turns, tiles_of
+from sasgeo_bench.search.plan import Disc, Mode, Null, Tile, Turns, in_threads, tiles_of
 from sasgeo_bench.search.shifts import Correlation
 
 _RIGHT_DEG: Final = 90.0
@@ -204,8 +203,8 @@ def dense(
             found.append((at, _Peaks.of(score, turn, most=SPARE * most)))
         return found
 
-    with ThreadPoolExecutor(threads) as pool:
-        parts = [part for some in pool.map(peaks_of, turns.bases) for part in some]
+    with in_threads(threads) as mapped:
+        parts = [part for some in mapped(peaks_of, turns.bases) for part in some]
     modes = []
     for at, tile in enumerate(tiles):
         peaks = _Peaks.joined([peaks for owner, peaks in parts if owner == at])

@@ -3,7 +3,6 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Final
@@ -24,6 +23,7 @@ from sasgeo_bench.search.plan import (
     Tile,
     Turns,
     all_around,
+    in_threads,
     place_m,
     thinned,
     tiles_of,
@@ -182,19 +182,19 @@ class Search:
         width = self.plan.width(0, patches)
         kept, behind = guesses[:width], [guesses[width - 1 :]]
         factor = self.factor
-        with ThreadPoolExecutor(self.plan.threads) as pool:
+        with in_threads(self.plan.threads) as mapped:
             while factor > 1:
                 factor, stride = factor // 2, stride.half()
                 step = partial(climbed, LevelView.of(self.field, self.template, factor), stride)
                 near = [disc.wider(_CORNER * factor * self.field.grid.cell_size_m) for disc in discs]
-                moved = _ranked(pool.map(step, kept, [near[guess.owner] for guess in kept]))
+                moved = _ranked(mapped(step, kept, [near[guess.owner] for guess in kept]))
                 merged = _merged(moved, factor * self.field.grid.cell_size_m, stride.yaw_deg)
                 width = self.plan.width(len(behind), patches)
                 kept, behind = merged[:width], [*behind, merged[width - 1 :]]
             near = [disc.wider(_CORNER * self.field.grid.cell_size_m) for disc in discs]
             level_view = LevelView.of(self.field, self.template, 1)
             for move in (climbed, climbed, polished):
-                kept = _ranked(pool.map(partial(move, level_view, stride), kept, [near[guess.owner] for guess in kept]))
+                kept = _ranked(mapped(partial(move, level_view, stride), kept, [near[guess.owner] for guess in kept]))
                 stride = stride.half()
         for rest in reversed(behind):
             kept = [*kept, *_below(kept, rest)]

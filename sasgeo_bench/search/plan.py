@@ -2,9 +2,11 @@
 """Settings and results of a search; the headings, scales and places that a prior allows."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +39,21 @@ class Plan:
     def width(self, depth: int, patches: int = 1) -> int:
         """Return how many modes are kept at a depth of the pyramid, 0 the coarsest, with so many times the beam."""
         return self.beam[min(depth, len(self.beam) - 1)] * patches
+
+
+@contextmanager
+def in_threads(threads: int) -> Iterator[Callable[..., Iterator[Any]]]:
+    """Yield a `map` over so many threads; of one it is Python's own, since to hand tasks over takes as long as they.
+
+    >>> with in_threads(2) as mapped:
+    ...     list(mapped(pow, (2, 3), (3, 2)))
+    [8, 9]
+    """
+    if threads == 1:
+        yield map
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        yield pool.map
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,9 +14,9 @@ from typing import Final, Self
 
 import cv2
 import numpy as np
+import scipy  # its parts are loaded where they are used: what only plans or carries pictures starts without them
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.geometry.pose import bearing_deg, rotation
@@ -222,7 +222,7 @@ class Attitude:
     def matrix(self) -> Points:
         """Return the matrix from the body's (forward, right, down) to (north, east, down), shape (3, 3)."""
         angles = (self.yaw_deg, self.pitch_deg, self.roll_deg)
-        return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+        return np.asarray(scipy.spatial.transform.Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -364,7 +364,9 @@ class Camera:
         Small turns of a camera that looks straight down are those of the body that carries it: pitch moves the view
         ahead, roll (right side down) to the left, yaw clockwise.
         """
-        body = Rotation.from_euler("ZYX", (error.yaw_deg, error.pitch_deg, error.roll_deg), degrees=True).as_matrix()
+        body = scipy.spatial.transform.Rotation.from_euler(
+            "ZYX", (error.yaw_deg, error.pitch_deg, error.roll_deg), degrees=True
+        ).as_matrix()
         down_of_nadir = Attitude(pitch_deg=_STRAIGHT_DOWN_DEG).matrix
         camera_of_carrier = _CAMERA_OF_BODY @ down_of_nadir.T
         matrix = camera_of_carrier @ body.T @ camera_of_carrier.T @ self.matrix

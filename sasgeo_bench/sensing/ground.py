@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
+import scipy  # its parts are loaded where they are used: what only plans or carries pictures starts without them
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
@@ -88,7 +88,7 @@ class Dem:
         with np.errstate(invalid="ignore"):
             within: NDArray[np.bool_] = np.all((uv >= 0) & (uv <= (self.grid.cols, self.grid.rows)), axis=1)
         at = np.where(within[:, None], uv - 0.5, 0.0)  # the lattice of centres
-        found = map_coordinates(self.cells_m, at[:, ::-1].T, order=1, mode="nearest", output=np.float64)
+        found = scipy.ndimage.map_coordinates(self.cells_m, at[:, ::-1].T, order=1, mode="nearest", output=np.float64)
         return np.where(within, found, np.nan)
 
     def meet(self, origin_m: Points, directions: Points) -> Points:

@@ -48,7 +48,9 @@ class PhotoHead:
 
 def read_head(path: Path, *, most_bytes: int = MOST_BYTES) -> PhotoHead:
     """Read the head of a photo; raise `ImageError` if it is no sound JPEG, TIFF or DNG of so many bytes at most."""
-    size = path.stat().st_size if path.is_file() else 0  # what is no file is refused when it is opened
+    size = path.stat().st_size if path.is_file() else -1  # what is no file is refused when it is opened
+    if size == 0:
+        raise ImageError(f"{path} is empty: copy it again from the drone")
     if size > most_bytes:
         raise ImageError(f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first")
     try:

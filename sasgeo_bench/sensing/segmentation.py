@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
+import scipy  # its parts are loaded where they are used: what only plans or carries pictures starts without them
 from numpy.typing import NDArray
-from scipy.optimize import brentq, minimize
 from scipy.special import expit, logit
 
 from sasgeo_bench.core.errors import ImageError
@@ -205,7 +205,7 @@ def _shifted_bytes(counts: NDArray[np.int64], share: float) -> NDArray[np.uint8]
     log_odds = _byte_log_odds()
     share = min(max(share, _LEAST_SHARE), 1 - _LEAST_SHARE)
     weights = counts / counts.sum()
-    shift = brentq(lambda by: float(weights @ expit(log_odds + by)) - share, -_MOST_SHIFT, _MOST_SHIFT)
+    shift = scipy.optimize.brentq(lambda by: float(weights @ expit(log_odds + by)) - share, -_MOST_SHIFT, _MOST_SHIFT)
     same[:SILENT] = np.floor(expit(log_odds + shift) * CERTAIN + 0.5)
     return same
 
@@ -263,7 +263,9 @@ def calibration_of(pixels: NDArray[np.integer]) -> tuple[float, float]:
         changed = np.exp(vector[0]) * log_odds + vector[1]
         return float(present @ np.logaddexp(0, -changed) + absent @ np.logaddexp(0, changed) + 0.5 * vector @ vector)
 
-    scale, shift = minimize(loss, np.zeros(2), method="L-BFGS-B", bounds=[(-3.0, 3.0), (-_MOST_SHIFT, _MOST_SHIFT)]).x
+    scale, shift = scipy.optimize.minimize(
+        loss, np.zeros(2), method="L-BFGS-B", bounds=[(-3.0, 3.0), (-_MOST_SHIFT, _MOST_SHIFT)]
+    ).x
     return float(np.exp(scale)), float(shift)
 
 

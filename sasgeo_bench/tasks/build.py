@@ -26,7 +26,7 @@ from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.edited_maps import changed_maps, degraded_map, edit_maps, nothing_to_ask
-from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer
+from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer, LoggedFlight
 from sasgeo_bench.tasks.frame_files import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.pictured_ground import PicturedGround
@@ -182,21 +182,14 @@ def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
         over = base if scene.pictured is None else base.within(scene.pictured.footprint)
         flown = None
         if request.flown is not None:
-            flown = request.flown.over(over, margin_m=suite.clear_m(scene))
+            flown = LoggedFlight.of(request.flown, over, margin_m=suite.clear_m(scene), group=group)
             seeds = seeds.under("flown", request.flown.key)  # another log has other ids: no answer fits both
         airspace = Airspace(
-            region=over,
-            scene=scene,
-            suite=suite,
-            split=request.split,
-            seeds=seeds,
-            group=group,
-            flown=flown,
-            start_s=None if request.flown is None else request.flown.start_s,
+            region=over, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group, flown=flown
         )
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
         airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))
-        pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice)
+        pilot = FlightDrawer.of(airspace, flights, request.choice)
         return pilot, [flight.site for flight in flights.values()]
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split, choice=request.choice)
@@ -381,6 +374,7 @@ def _origin(
     pictured = filter(None, (drawer.scene.pictured, drawer.scene.pictured_elsewhere))
     owners = "; ".join(dict.fromkeys(item.imagery.record.attribution for item in pictured))
     texts |= {"picture_attribution": owners} if owners else {}
+    texts |= drawer.told if isinstance(drawer, FlightDrawer) else {}
     return TaskOrigin(
         suite=card.name,
         suite_version=card.version,

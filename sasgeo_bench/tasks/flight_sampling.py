@@ -2,7 +2,7 @@
 """Flights of a suite over a region, and their queries and truths: views in order, with odometry between them."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Final
 
@@ -10,16 +10,21 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.core.errors import ConfigError, FlightError
-from sasgeo_bench.flights.drift_profile import load_profile
+from sasgeo_bench.core.errors import ConfigError, FlightError, counted
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.flights.drift_profile import DriftProfile, load_profile
+from sasgeo_bench.flights.gnss import CORRELATION_S, SIGMAS, SecondReceiver, WeakGnss, draw_gnss
 from sasgeo_bench.flights.kinematics import fly
-from sasgeo_bench.flights.odometry import Odometry, draw_odometry
+from sasgeo_bench.flights.logs import FlownPath
+from sasgeo_bench.flights.odometry import LoggedSteps, Odometry, draw_odometry
+from sasgeo_bench.flights.own_odometry import OwnOdometry
 from sasgeo_bench.flights.plans import KINDS, PlanKind, flight_area, plan_flight
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Pose, Prior, rotation
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import (
+    GNSS_M,
     SEQUENCE_DIGITS,
     TWIN_EAST,
     TWIN_NORTH,
@@ -58,20 +63,28 @@ from sasgeo_bench.tasks.suites.flights import (
 )
 
 Floats = NDArray[np.float64]
+Disc = tuple[tuple[float, float] | None, float | None]  # middle and radius of a prior's, None where it has none
 
 UTC: Final = "utc_s"  # measured: when a view of a logged flight was flown, seconds since 1970; the log may not tell it
+LOGGED: Final = "is_logged"  # measured: whether the step to a view is of the log's own odometry
+GNSS_OFF: Final = "gnss_off_m"  # measured: how far a view is from the fix of its prior
 _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flight:
-    """A flight over a region: N views, their mean spacing, the scale that all have, and how maps are changed for it."""
+    """A flight over a region: N views, their mean spacing, the scale that all have, and how maps are changed for it.
+
+    `own` are the steps of its log's odometry between the views, `gnss` the fixes of its log's weaker receiver.
+    """
 
     site: Site
     views: Trajectory
     spacing_m: float
     scale: float
     plot: Plot | None = None
+    own: LoggedSteps | None = None
+    gnss: WeakGnss | None = None
 
     @property
     def length_m(self) -> float:
@@ -84,6 +97,88 @@ class Flight:
         return len(self.views) // 2
 
 
+@dataclass(frozen=True, kw_only=True)
+class LoggedFlight:
+    """A flight that was flown over a region, and what its log has besides, or why it has none.
+
+    Parameters
+    ----------
+    path : Trajectory
+        The longest stretch over the region.
+    start_s : float, optional
+        When its clock was 0, seconds since 1970, UTC, if that is known.
+    own : OwnOdometry or str
+        Odometry that fused no GNSS.
+    receiver : SecondReceiver or str
+        A weaker receiver beside that of the truth.
+    drift : DriftProfile, optional
+        What its odometer declares and is drawn by, where a suite is not about a profile; by default that of the suite.
+    """
+
+    path: Trajectory
+    start_s: float | None
+    own: OwnOdometry | str
+    receiver: SecondReceiver | str
+    drift: DriftProfile | None = None
+
+    @classmethod
+    def of(cls, flown: FlownPath, region: Region, *, margin_m: float, group: PriorGroup) -> "LoggedFlight":
+        """Read a log over a region; a receiver only where priors are of one."""
+        path = flown.over(region, margin_m=margin_m)
+        own: OwnOdometry | str
+        receiver: SecondReceiver | str = ""
+        try:
+            own = flown.own_odometry()
+        except FlightError as error:
+            if flown.topic is not None:  # which was asked for by name
+                raise
+            own = str(error)
+        if group.is_gnss:
+            try:
+                receiver = flown.second_receiver()
+            except FlightError as error:
+                receiver = str(error)
+        return cls(path=path, start_s=flown.start_s, own=own, receiver=receiver, drift=flown.profile)
+
+    def odometry_words(self, flight: Flight) -> str:
+        """Return where the odometry of the flight is from, and tell how far that of its log is off."""
+        name = Mission().profile if self.drift is None else self.drift.id
+        drawn = "profiles of drift" if self.drift is None else f"the profile {name}"
+        own, steps = self.own, flight.own
+        if isinstance(own, str) or steps is None:
+            return f"drawn by {drawn}: {own}"
+        if not steps.is_logged.any():
+            return f"drawn by {drawn}: {own.name} fused GNSS or has no poses along the flight ({own.told})"
+        off_pct, off_deg = steps.off(flight.views)
+        turned = "" if math.isnan(off_deg) else f" and its turns by {off_deg:.2g} deg"
+        tell(f"steps of {own.name} are off the receiver by {off_pct:.2g} % of the way{turned} (medians)")
+        words = own.where(steps)
+        if not steps.is_logged.all():
+            words += f", drawn by the profile {name} where it fused GNSS or has no poses ({own.told})"
+        if math.isnan(off_deg):
+            words += "; turns are drawn, as its headings are the vehicle's and so are those of the truth"
+        return f"{words}; noise is declared as the profile {name} has it"
+
+
+def gnss_words(flight: Flight, group: PriorGroup, logged: LoggedFlight | None) -> str:
+    """Return where the fixes of priors by a weak receiver are from, and tell how far those of a log are off."""
+    gnss, receiver = flight.gnss, "no log has it" if logged is None else logged.receiver
+    if isinstance(receiver, str) or gnss is None or not np.isfinite(gnss.radius_m).any():
+        disc_m = group.radius_m or math.nan
+        why = receiver if isinstance(receiver, str) else f"{receiver.name} has no fix along the flight"
+        drawn = f"drawn, {disc_m / SIGMAS:.3g} m on each axis, correlated over {CORRELATION_S:g} s"
+        return f"{drawn}, in discs of {disc_m:g} m: {why}"
+    is_fix = np.isfinite(gnss.radius_m)
+    away_m, radius_m = gnss.away_m[is_fix], gnss.radius_m[is_fix]
+    tell(
+        f"fixes of {receiver.name} are off the truth by {np.median(away_m):.1f} m (median), in "
+        f"{(away_m > radius_m).sum()} of {counted(len(radius_m), 'view')} by more than their disc"
+    )
+    lacks = f", none in {(~is_fix).sum()} of {counted(len(is_fix), 'view')}" if not is_fix.all() else ""
+    stated = f"discs of {SIGMAS:g} times the accuracy that it states, {np.median(radius_m):.3g} m (median)"
+    return f"of {receiver.name} of the log, {stated}{lacks}"
+
+
 def pose_of(views: Trajectory, frame: int, scale: float) -> Pose:
     """Return the pose of one view."""
     east_m, north_m = views.position_m[frame, :2].tolist()
@@ -94,8 +189,7 @@ def pose_of(views: Trajectory, frame: int, scale: float) -> Pose:
 class Airspace:
     """Where the flights of a suite may go, and the seeds of region and suite that they are drawn from.
 
-    `flown` is a flight that was flown there; it is the only one then. `start_s` is when its clock was 0, seconds since
-    1970, UTC, if that is known.
+    `flown` is a flight that was flown there; it is the only one then.
     """
 
     region: Region
@@ -104,8 +198,7 @@ class Airspace:
     split: Split
     seeds: Seeds
     group: PriorGroup
-    flown: Trajectory | None = None
-    start_s: float | None = None
+    flown: LoggedFlight | None = None
 
     def seeds_of(self, index: int) -> Seeds:
         """Return the seeds of one flight."""
@@ -164,11 +257,11 @@ class Airspace:
         sigmas = float(np.clip(seeds.rng("scale").standard_normal(), -_SCALE_CUT, _SCALE_CUT))
         return 1.0 + self.group.scale_sigma * sigmas, float(seeds.rng("spacing").uniform(*self.suite.every_m))
 
-    def _logged(self, flown: Trajectory) -> Flight:
+    def _logged(self, flown: LoggedFlight) -> Flight:
         """Return the flight that was flown, or raise `ConfigError` that says why it cannot be asked."""
         seeds = self.seeds_of(0)
         scale, spacing_m = self._scale_and_spacing_m(seeds)
-        views = _spaced(flown, float(flown.distance_m[-1]), spacing_m, seeds.rng("path", "flown"))
+        views = _spaced(flown.path, float(flown.path.distance_m[-1]), spacing_m, seeds.rng("path", "flown"))
         where, plot = self.scene.map.region, None
         if not self._is_in_one_part(views):
             raise ConfigError(
@@ -188,7 +281,11 @@ class Airspace:
                 f"the flight over {where} sees too little that is mapped: {self.suite.card.min_density:.0%} are needed"
             )
         site = Site(index=0, pose=pose_of(views, 0, scale), block=self._block(views), density=0.0)
-        return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot)
+        own = None if isinstance(flown.own, str) else flown.own.steps(views.time_s)
+        gnss = None
+        if not isinstance(flown.receiver, str):
+            gnss = flown.receiver.along(views.time_s, views.position_m[:, :2], epsg=self.scene.map.grid.epsg)
+        return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot, own=own, gnss=gnss)
 
     def _plot(self, views: Trajectory, before: Sequence[Flight], rng: np.random.Generator) -> Plot | None:
         """Return how maps are changed for a flight after those before it; None if they are not, or have no room."""
@@ -284,12 +381,31 @@ _MOST_GAP: Final = 1 / 3  # of a flight
 
 @dataclass(frozen=True, kw_only=True)
 class FlightDrawer:
-    """Draw the flights of one suite on one region; `carried` caches where carried drones come from."""
+    """Draw the flights of one suite on one region; `carried` caches where carried drones come from.
+
+    `told` says where odometry is from (`odometry`), and fixes of a weak receiver (`gnss`): fields of `TaskOrigin`.
+    """
 
     airspace: Airspace
     flights: dict[int, Flight]
     choice: Choice = EVERYTHING
+    told: Mapping[str, str] = field(default_factory=dict)
     carried: dict[tuple[int, float], Trajectory | None] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, airspace: Airspace, flights: dict[int, Flight], choice: Choice) -> "FlightDrawer":
+        """Return what draws some flights, and tell where their odometry and their priors are from."""
+        told, suite, flown = {}, airspace.suite, airspace.flown
+        first = next(iter(flights.values()))
+        if flown is not None:
+            told["odometry"] = flown.odometry_words(first)
+            tell(f"odometry: {told['odometry']}")
+            if flown.drift is not None or (first.own is not None and first.own.is_logged.any()):
+                airspace = replace(airspace, suite=replace(suite, variants=suite.variants + suite.of_own))
+        if airspace.group.is_gnss:
+            told["gnss"] = gnss_words(first, airspace.group, flown)
+            tell(f"prior: fixes {told['gnss']}")
+        return cls(airspace=airspace, flights=flights, choice=choice, told=told)
 
     @property
     def suite(self) -> FlightSuite:
@@ -378,24 +494,57 @@ class FlightDrawer:
             measured["carried_m"] = round(carried_m, 1)
             distance_m = np.where(np.arange(len(views)) < flight.middle, distance_m, distance_m - carried_m)
         unseen, time_s = _unseen(flight, mission), views.time_s - views.time_s[0]
+        gnss = self._gnss(flight, mission, before)
+        start_s = None if self.airspace.flown is None else self.airspace.flown.start_s
         for frame in range(len(views)):
             is_lost = mission.is_lost and frame == flight.middle
             step = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
             flown = {"distance_m": round(float(distance_m[frame]), 1), "time_s": round(float(time_s[frame]), 2)}
             own = flown | {"is_seen": float(not unseen[frame])}
-            if self.airspace.start_s is not None:
-                own[UTC] = round(self.airspace.start_s + float(views.time_s[frame]), 3)
-            yield self._view(job, mission, pose_of(views, frame, flight.scale), step, own | measured)
+            if flight.own is not None and mission.takes_log and frame > 0:
+                own[LOGGED] = float(flight.own.is_logged[frame - 1] and (before is None or frame > flight.middle))
+            if start_s is not None:
+                own[UTC] = round(start_s + float(views.time_s[frame]), 3)
+            fix = None
+            if gnss is not None:
+                place_m = views.position_m[frame, :2].tolist()
+                # The start's radius bounds what a tracker searches on the way, where a receiver soon states less
+                least_m = 0.0 if frame else GNSS_M
+                fix = gnss.disc(frame, (place_m[0], place_m[1]), least_m=least_m)
+                own |= {GNSS_OFF: round(float(gnss.away_m[frame]), 1)} if fix[0] is not None else {}
+            yield self._view(job, pose_of(views, frame, flight.scale), step, measured=own | measured, fix=fix)
 
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:
         """Return what the odometer says: to the middle and from there on what it says in the control."""
         seeds, profile, into = self._seeds(flight.site), load_profile(mission.profile), flight.middle - 1
+        flown = self.airspace.flown
+        if flown is not None and flown.drift is not None and mission.takes_log:
+            profile = flown.drift
         step, control = (
             draw_odometry(flown, profile, belief=mission.belief, rng=seeds.rng("odometry", mission.draw))
             for flown in (views, flight.views)
         )
+        if flight.own is not None and mission.takes_log:
+            control = flight.own.over(control, profile, belief=mission.belief)
+            step = control if views is flight.views else step
         both = {item.name: (getattr(step, item.name), getattr(control, item.name)) for item in fields(Odometry)}
         return Odometry(**{name: np.concatenate([own[:into], usual[into:]]) for name, (own, usual) in both.items()})
+
+    def _gnss(self, flight: Flight, mission: Mission, before: Trajectory | None) -> WeakGnss | None:
+        """Return the fixes of priors at the views of a flight, after another first half if it has one."""
+        group = mission.group or self.airspace.group
+        if not group.is_gnss or group.radius_m is None:
+            return None
+        seeds, radius_m = self._seeds(flight.site), group.radius_m
+        drawn = draw_gnss(flight.views.time_s, radius_m=radius_m, rng=seeds.rng("gnss", group.name))
+        here = flight.gnss or drawn
+        if before is None:
+            return here
+        there = draw_gnss(before.time_s, radius_m=radius_m, rng=seeds.rng("gnss", group.name, "carried"))
+        return WeakGnss(
+            off_m=np.concatenate([there.off_m, here.off_m[flight.middle :]]),
+            radius_m=np.concatenate([there.radius_m, here.radius_m[flight.middle :]]),
+        )
 
     def _seeds(self, site: Site) -> Seeds:
         return self.airspace.seeds_of(site.index)
@@ -407,9 +556,10 @@ class FlightDrawer:
         return self.carried[key]
 
     def _view(
-        self, job: Job, mission: Mission, pose: Pose, step: Step, measured: dict[str, float]
+        self, job: Job, pose: Pose, step: Step, *, measured: dict[str, float], fix: Disc | None
     ) -> tuple[Query, Truth]:
-        scene, variant, group = self.scene, job.variant, mission.group or self.airspace.group
+        scene, variant, mission = self.scene, job.variant, self.suite.mission(job.variant)
+        group = mission.group or self.airspace.group
         seeds = self._seeds(job.site)
         of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
         site = replace(job.site, pose=pose, density=drawn_share(scene.map, pose, variant))
@@ -425,6 +575,8 @@ class FlightDrawer:
         if step.frame == 0:
             rivals_m = () if copy is None else ((copy.easting_m, copy.northing_m),)
             prior = make_prior(pose, group, rng=seeds.rng("prior", group.name), rivals_m=rivals_m)
+        if fix is not None:
+            prior = replace(prior, center_m=fix[0], radius_m=fix[1])
         query = Query(
             query_id=view_id(step.sequence_id, step.frame),
             track="sequence",

@@ -82,44 +82,58 @@ class PriorGroup:
         Standard deviation of the heading: 5 degrees, 20 degrees, or nothing known.
     scale_sigma : float
         Standard deviation of the scale around 1: 0.01 (a laser altimeter), 0.03, 0.10 or 0.15.
+    is_gnss : bool
+        Of flights: whether every view has a disc, around the fix of a weak receiver. `radius_m` is that of a drawn one.
 
     Examples
     --------
     >>> group = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)
     >>> group.name, group.words
     ('r500-weak-s3', 'searched: disc of 500 m, heading +-20 deg, scale +-3 %')
+    >>> PriorGroup.parse("gnss") == PriorGroup.parse("gnss-weak-s3")
+    True
     """
 
     radius_m: float | None
     yaw: Yaw
     scale_sigma: float
+    is_gnss: bool = False
 
     @property
     def name(self) -> str:
         """Return the short name, as in "r500-weak-s3": metres, yaw, per cent of scale."""
         radius = "none" if self.radius_m is None else f"{self.radius_m:g}"
-        return f"r{radius}-{self.yaw}-s{100 * self.scale_sigma:g}"
+        place = GNSS if self.is_gnss else f"r{radius}"
+        return f"{place}-{self.yaw}-s{100 * self.scale_sigma:g}"
 
     @property
     def words(self) -> str:
         """Return the group in words, as people read it."""
         place = "whole map" if self.radius_m is None else f"disc of {self.radius_m:g} m"
+        place = "disc around each fix of a weak receiver" if self.is_gnss else place
         heading = {"known": "+-5 deg", "weak": "+-20 deg", "unknown": "unknown"}[self.yaw]
         return f"searched: {place}, heading {heading}, scale +-{100 * self.scale_sigma:g} %"
 
     @classmethod
     def parse(cls, name: str) -> Self:
         """Return the group of a name; raise a ConfigError if there is none."""
-        declared = product(RADII_M, YAWS, SCALE_SIGMAS)
-        groups = {group.name: group for group in (cls(radius_m=r, yaw=y, scale_sigma=s) for r, y, s in declared)}
+        places = [*((radius_m, False) for radius_m in RADII_M), (GNSS_M, True)]
+        declared = [
+            cls(radius_m=radius_m, yaw=yaw, scale_sigma=scale_sigma, is_gnss=is_gnss)
+            for (radius_m, is_gnss), yaw, scale_sigma in product(places, YAWS, SCALE_SIGMAS)
+        ]
+        groups = {group.name: group for group in declared}
+        groups[GNSS] = groups[f"{GNSS}-weak-s3"]
         if name not in groups:
             raise ConfigError(
-                f"{name!r} is no prior group: r50, r100, r250, r500, r2000 or rnone, then known, weak or unknown yaw, "
-                "then s1, s3, s10 or s15, as in r500-weak-s3"
+                f"{name!r} is no prior group: r50, r100, r250, r500, r2000, rnone, or of flights {GNSS}, then known, "
+                "weak or unknown yaw, then s1, s3, s10 or s15, as in r500-weak-s3"
             )
         return groups[name]
 
 
+GNSS: Final = "gnss"  # prior groups of a weak receiver
+GNSS_M: Final = 50.0  # radius of the disc around a drawn fix: tens of metres in a street, or beside a jammer
 RADII_M: Final = (None, 50.0, 100.0, 250.0, 500.0, 2000.0)
 SCALE_SIGMAS: Final = (0.01, 0.03, 0.10, 0.15)
 YAWS: Final[tuple[Yaw, ...]] = ("known", "weak", "unknown")
@@ -233,7 +247,7 @@ class Query(_Question):
         Until a segmenter has made evidence of them, all of `evidence` is unknown.
     step : Step, optional
         Where the query stands in a flight; None for a view alone. Only the first view of a flight has a prior of place
-        and heading.
+        and heading; in the groups `gnss` every view that has a fix has one of place.
 
     Raises
     ------

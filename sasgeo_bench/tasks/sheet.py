@@ -570,7 +570,7 @@ class Ground:
             layers = read_layers(path, window=(top, left, bottom - top, right - left))
             extent_m = (west + left * cell_m, west + right * cell_m, north - bottom * cell_m, north - top * cell_m)
         step = max(1, max(layers.shape[1:]) // _DRAWN_CELLS)
-        picture = _PALE + (1 - _PALE) * paint_overview(manifest, layers[:, ::step, ::step])
+        picture = _PALE + (1 - _PALE) * (paint_overview(manifest, layers[:, ::step, ::step]) / 255)
         return cls(picture=picture, extent_m=extent_m, bounds_m=bounds_m)
 
 

@@ -450,6 +450,8 @@ class TaskOrigin(Document):
     attribution: str | None = None
     picture_attribution: str | None = None  # of all imagery that real pictures are cut out of
     segmenter: dict[str, str] | None = None  # what made the evidence of the pictures: name, version, hash
+    odometry: str | None = None  # of a flight that was flown: of its log, or drawn, and why
+    gnss: str | None = None  # of priors by a weak receiver: of a log, or drawn, and why
     failed_pictures: Count | None = None  # that the segmenter failed at
     provenance: Provenance = Provenance()  # of the map
 

@@ -112,6 +112,13 @@ def test_help_names_every_command_and_reads_the_code_of_none():
         assert set(commands) <= set(ended.stdout.split())
 
 
+def test_the_name_of_the_program_alone_and_h_print_the_help(program):
+    code, alone, err = program()
+    assert (code, err) == (0, "")
+    assert alone == program("-h")[1] == program("--help")[1]
+    assert program("verify", "-h")[1] == program("verify", "--help")[1]
+
+
 @pytest.mark.parametrize(("name", "file"), [one for group in COMMANDS.values() for one in group.items()])
 def test_every_command_can_be_read_and_has_the_help_that_the_program_shows(program, name, file):
     code, shown, err = program(name, "--help")
@@ -142,6 +149,15 @@ def test_the_towns_of_the_demo_are_a_line_and_your_own_are_listed_whatever_their
     assert code == 0, err
     assert [line.split()[0] for line in out.splitlines() if line.startswith("demo-")] == ["demo-mine"]
     assert "and 36 small towns of `leaderboard demo`, demo-..." in err
+
+
+def test_what_new_region_wrote_is_listed_without_a_word_about_it(program, tmp_path):
+    (tmp_path / "my-regions").mkdir()  # where new-region writes, in the folder that a program runs in
+    small_town(tmp_path / "my-regions", **{'id = "town-suburb"': 'id = "mine"'}).rename(
+        tmp_path / "my-regions/mine.toml"
+    )
+    listed = program("list", "regions")[1].split()
+    assert {"mine", "vaduz"} <= set(listed)
 
 
 def test_inspect_draws_a_map_that_was_built_on_the_way_to_queries(program, tmp_path):

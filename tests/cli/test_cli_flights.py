@@ -15,6 +15,7 @@ from sasgeo_bench.flights.trajectory import Trajectory, read_tum, write_tum
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.task_files import Task
 from tests.flights.autopilots import Flown, fusing, px4_drift, tlog, ulog, write
+from tests.tasks.test_flown import Logged
 
 
 @pytest.fixture
@@ -118,6 +119,13 @@ def test_what_is_read_of_a_log_is_printed_with_its_columns_and_units(program, tm
         "yaw from 90.0 to 90.0 deg",
         "longitude from 11.0010 to 11.0013, latitude from 49.0050 to 49.0050 deg",
     ]
+
+
+def test_a_flight_over_the_antimeridian_lies_from_west_to_east(program, tmp_path) -> None:
+    rows = [f"{at},-16.5,{lon}\n" for at, lon in enumerate((179.9998, 179.9999, 180.0, -179.9999, -179.9998))]
+    (tmp_path / "log.csv").write_text("time_s,lat,lon\n" + "".join(rows))
+    _, out, _ = program("import-flight", "log.csv")
+    assert out.splitlines()[-1] == "longitude from 179.9998 to -179.9998, latitude from -16.5000 to -16.5000 deg"
 
 
 def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_path) -> None:
@@ -248,6 +256,31 @@ def test_what_is_read_of_the_log_of_an_autopilot_is_printed_with_its_messages(pr
         "roll from 0.0 to 0.0 deg",
         "longitude from 9.5200 to 9.5230, latitude from 47.1400 to 47.1420 deg",
     ]
+
+
+def test_where_odometry_and_priors_are_from_is_said_and_shown_by_inspect(program, mistake, lay_towns, tmp_path) -> None:
+    logged = Logged(lay_towns(tmp_path / "out", "town-grid"))
+    logged.write(tmp_path / "a.ulg", has_camera=True, second_m=9.0)
+    words = ("import-flight", "a.ulg", "--region", "town-grid", "--height", "90", "--suite", "flight-gap")
+    code, out, err = program(*words, "--prior", "gnss", "--drift", "vio-stereo")
+    assert code == 0, err
+    told = (
+        "of the log (vehicle_visual_odometry 0) in ",
+        "noise is declared as the profile vio-stereo has it",
+        "of sensor_gps 0 of the log, discs of 3 times the accuracy that it states, 15 m (median)",
+    )
+    shown = " ".join(program("inspect", out.strip())[1].split())
+    assert all(part in err and part in shown for part in told)
+    before = mistake("import-flight", "a.ulg", "--drift", "vio-stereo")
+    assert "--drift needs --region" in before
+    assert "--topic is of the odometry of a bag, and a.ulg gives none" in mistake(*words, "--topic", "/vo")
+    assert "mine.toml cannot be read as a drift profile" in mistake(*words, "--drift", "mine.toml")
+    words = ("make-queries", "--suite", "flight-gap", "--regions", "town-grid", "--n", "1")
+    assert "--drift is of a flight: name its log by --flight" in mistake(*words, "--drift", "vio-stereo")
+    assert "--odometry is of a flight: name its log by --flight" in mistake(*words, "--odometry", "drawn")
+    code, _, err = program(*words, "--flight", "a.ulg", "--height", "90", "--odometry", "drawn")
+    assert code == 0, err
+    assert "odometry: drawn by profiles of drift: --odometry drawn says so" in err
 
 
 def test_drift_of_a_log_is_that_of_its_stretches_without_gnss(program, mistake, tmp_path) -> None:

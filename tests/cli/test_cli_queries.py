@@ -148,7 +148,7 @@ def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
     [
         (("--n", "0"), "--n must be at least 1, got 0"),
         (("--suite", "claen"), "there is no suite 'claen', did you mean 'clean'?"),
-        (("--prior", "r500-weak"), "'r500-weak' is no prior group: r50, r100, r250, r500, r2000 or rnone"),
+        (("--prior", "r500-weak"), "'r500-weak' is no prior group: r50, r100, r250, r500, r2000, rnone, or of fl"),
         (("--region-files", "nowhere"), "there is no folder nowhere"),
         (("--detector", "profile"), "detector 'profile' needs a perception profile: name its file with make-queries"),
         (("--profile", "none.toml"), "none.toml cannot be read as a perception profile"),

@@ -123,7 +123,10 @@ def test_a_run_without_accepted_fixes_sends_nothing(program, root, task, flight)
     count = len(flights_of(task)[flight])
     code, _, err = program("replay", run, "--flight", flight, "--to", "a.tum")
     assert code == 2
-    assert err.splitlines()[-1] == f"sasgeo-bench: none of {count} fixes is accepted: --all takes them as well"
+    assert (
+        err.splitlines()[-1]
+        == f"sasgeo-bench: none of {count} fixes is accepted: --all takes them (a file, or --as gps_input)"
+    )
 
 
 def test_a_task_elsewhere_is_named_by_its_folder(program, task, flight, tmp_path) -> None:

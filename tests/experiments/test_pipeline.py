@@ -167,6 +167,27 @@ def test_the_command_ends_with_the_board_and_what_to_do_next(made, program, monk
     assert err.splitlines()[-1].startswith("next: sasgeo-bench leaderboard small.toml --matcher NAME adds one of yours")
 
 
+def test_the_board_of_a_pipeline_has_limits_and_requirements_of_ones_own(made):
+    plan, _, _ = made
+    board = run_pipeline(replace(plan, within=["7m"], require=["80% within 60 m, p95 latency 60 s"])).board
+    assert {"within_7m", "within_60m", "latency_within_60s"} <= set(board.leaderboard["metric"])
+    assert (board.about.within, board.about.require) == (["7m"], ["80% within 60 m, p95 latency 60 s"])
+
+
+def test_the_command_takes_limits_and_requirements_as_score_does(made, program, mistake, monkeypatch, tmp_path):
+    _, board, _ = made
+    plans = []
+    monkeypatch.setattr("sasgeo_bench.cli.boards.run_pipeline", lambda plan, **_: plans.append(plan) or board)
+    (tmp_path / "small.toml").write_text(TEXT, encoding="utf-8")
+    words = ("leaderboard", "small.toml", "--within", "7m", "--require", "80% within 50 m")
+    code, _, err = program(*words)
+    assert code == 0, err
+    assert [(list(plan.within), list(plan.require)) for plan in plans] == [(["7m"], ["80% within 50 m"])]
+    assert "'most within 50 m', which is no requirement" in mistake(*words, "--require", "most within 50 m")
+    assert "'7 miles' is no limit" in mistake(*words, "--within", "7 miles")
+    assert len(plans) == 1
+
+
 def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     plan, board, _ = made
     queries = plan.out / "tasks" / "clean" / "town-suburb" / "queries.parquet"

@@ -1,11 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Logs of ArduPilot: receivers by their number, leap seconds by date, and each column as mavlogdump prints it."""
+"""Logs of ArduPilot: receivers by their number, leap seconds by date, and damaged logs."""
 
-import csv
-import subprocess
-import sys
 import warnings
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -13,7 +9,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sasgeo_bench.core.errors import FlightError
-from sasgeo_bench.flights.log_dataflash import read_messages
 from sasgeo_bench.flights.logs import read_log
 from tests.flights.autopilots import (
     GROUND_M,
@@ -151,7 +146,7 @@ def test_an_autopilot_that_restarted_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("data", [b"", b"\xa3\x95", b"PK" * 99, b"no log\n" * 9, bytes((0xA3, 0x95, 200)) * 50])
 @pytest.mark.parametrize("name", ["a.bin", "a.log"])
 def test_a_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str, data: bytes, capfd) -> None:
-    with pytest.raises(FlightError, match=r"a\.(bin|log): (cannot be read as such a log|no place)") as fault:
+    with pytest.raises(FlightError, match=r"a\.(bin|log): (cannot be read as such a log|no place|empty)") as fault:
         read_log(write(tmp_path / name, data))
     assert str(fault.value).isprintable()
     assert capfd.readouterr() == ("", "")  # the library prints what it meets
@@ -161,19 +156,3 @@ def test_a_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, name: str,
 @given(seed=st.integers(0, 2**32 - 1), part=st.floats(0, 1))
 def test_bytes_that_changed_are_read_or_refused(tmp_path: Path, seed: int, part: float) -> None:
     assert wrong_of_damaged(tmp_path / "a.bin", dataflash(ardupilot_rows(Flown(count=20))), seed=seed, part=part) == []
-
-
-@pytest.mark.parametrize("name", ["GPS", "GPA", "POS", "ATT"])
-def test_each_column_is_what_mavlogdump_of_the_library_prints(tmp_path: Path, name: str) -> None:
-    path = write(tmp_path / "a.bin", dataflash(ardupilot_rows(FLOWN)))
-    tool = Path(sys.executable).parent / "mavlogdump.py"
-    assert find_spec("pymavlink")
-    done = subprocess.run(  # noqa: S603 - of the environment that runs the tests
-        [sys.executable, tool, "--format", "csv", "--types", name, path], capture_output=True, text=True, check=True
-    )
-    table = list(csv.DictReader(done.stdout.splitlines()))
-    columns = read_messages(path, [name]).messages[name]
-    assert len(table) == len(columns["TimeUS"])
-    assert set(table[0]) - {"timestamp"} == set(columns)
-    for column, values in columns.items():
-        assert values == pytest.approx([float(row[column]) for row in table], rel=1e-9), column

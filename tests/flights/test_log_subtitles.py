@@ -186,6 +186,20 @@ def test_what_not_all_subtitles_say_is_not_read_and_noted(read: Written) -> None
     assert "rel_alt of 2 of 3 subtitles: not read" in found.log.notes
 
 
+@pytest.mark.parametrize("end", ["[rel_alt: 1.3", "[latitude: 47.14", "GPS (9.52, 47"])
+def test_subtitles_that_were_cut_off_are_read_up_to_the_cut(tmp_path: Path, end: str) -> None:
+    text = "[latitude: 47.14000#] [longitude: 9.520001] [rel_alt: 60.1 abs_alt: 500.2]"
+    path = tmp_path / "a.srt"
+    path.write_text("".join(block(at, one) for at, one in enumerate([*two(text), end], start=1)).rstrip("\n"))
+    log = read_log(path)
+    assert log.lat_deg.tolist() == [47.140003, 47.140004]
+    assert log.height_m is not None
+    assert log.height_m.tolist() == [60.1, 60.1]
+    assert "cut off: the file ends within a subtitle, and is read up to there" in log.notes
+    path.write_text("".join(block(at, one) for at, one in enumerate(two(text), start=1)).rstrip("\n"))
+    assert not any("cut off" in note for note in read_log(path).notes)
+
+
 FAULTS = {
     "no subtitles": ("hello\n", "holds no subtitles"),
     "words alone": (block(1, "Hello") + block(2, "there"), r"no place in 2 subtitles: .* or name a log"),
@@ -197,7 +211,7 @@ FAULTS = {
         "time goes back by 9 s",
     ),
     "a jump": (block(1, MINI.replace("#", "3")) + block(2, MINI.replace("47.14000#", "48.0")), "moves at"),
-    "empty": ("", "holds no subtitles"),
+    "empty": ("", "empty: copy it anew"),
 }
 
 

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Telemetry logs: one vehicle of several, the autopilot's clock, and each column as mavlogdump prints it."""
+"""Telemetry logs: one vehicle of several, the autopilot's clock, and damaged logs."""
 
-import csv
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +9,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sasgeo_bench.core.errors import FlightError
-from sasgeo_bench.flights.log_telemetry import FIELDS, read_telemetry
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import read_log
 from tests.flights.autopilots import BOOT_S, GROUND_M, START_S, Flown, stamps_us, tlog, write, wrong_of_damaged
@@ -110,7 +106,7 @@ def test_a_log_that_was_cut_off_or_damaged_is_read_for_the_rest(tmp_path: Path) 
     assert log.notes[-1] == "damaged: 1 messages and 0 bytes beside that are passed over"
 
 
-@pytest.mark.parametrize("data", [b"", b"PK" * 99, bytes(99), (0).to_bytes(8, "big") + b"\xfd"])
+@pytest.mark.parametrize("data", [b"PK" * 99, bytes(99), (0).to_bytes(8, "big") + b"\xfd"])
 def test_a_file_that_is_no_log_is_refused_in_one_line(tmp_path: Path, data: bytes) -> None:
     with pytest.raises(FlightError, match=r"a\.tlog: no place: no message of GPS_RAW_INT or GLOBAL_POSITION_INT"):
         read_log(write(tmp_path / "a.tlog", data))
@@ -126,18 +122,3 @@ def test_an_autopilot_that_restarted_is_refused(tmp_path: Path) -> None:
 @given(seed=st.integers(0, 2**32 - 1), part=st.floats(0, 1))
 def test_bytes_that_changed_are_read_or_refused(tmp_path: Path, seed: int, part: float) -> None:
     assert wrong_of_damaged(tmp_path / "a.tlog", tlog(Flown(count=20)), seed=seed, part=part) == []
-
-
-@pytest.mark.parametrize("name", ["ATTITUDE", "GLOBAL_POSITION_INT", "GPS_RAW_INT", "SYSTEM_TIME"])
-def test_each_column_is_what_mavlogdump_of_the_library_prints(tmp_path: Path, name: str) -> None:
-    path = write(tmp_path / "a.tlog", tlog(FLOWN))
-    tool = Path(sys.executable).parent / "mavlogdump.py"
-    done = subprocess.run(  # noqa: S603 - of the environment that runs the tests
-        [sys.executable, tool, "--format", "csv", "--types", name, path], capture_output=True, text=True, check=True
-    )
-    table = list(csv.DictReader(done.stdout.splitlines()))
-    columns = read_telemetry(path).messages[name]
-    assert len(table) == len(columns["received"]) == len(FLOWN.time_s)
-    assert columns["received"] == pytest.approx([float(row["timestamp"]) for row in table], abs=1e-5)
-    for column in FIELDS[name]:
-        assert columns[column] == pytest.approx([float(row[f"{name}.{column}"]) for row in table], rel=1e-7), column

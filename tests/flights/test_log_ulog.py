@@ -195,7 +195,7 @@ def test_a_flight_that_never_leaves_the_ground_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "match"),
     [
-        (b"", "cannot be read as such a log"),
+        (b"", "empty: copy it anew"),
         (b"ULog\x01\x12\x35\x01" + bytes(8), "no place: no message of vehicle_gps_position, sensor_gps or vehicle_gl"),
         (b"PK" * 99, "cannot be read as such a log"),
         (ulog({RECEIVER: (autopilots.GPS_114, gps_rows(FLOWN, fix_type=2))}), "no place: 200 messages without a fix"),

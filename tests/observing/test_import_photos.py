@@ -28,7 +28,7 @@ from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights, PosedPic
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.sensing.crops import drawn_crops
-from sasgeo_bench.tasks.query import TRUTH_SIGMA
+from sasgeo_bench.tasks.query import TRUTH_SIGMA, PriorGroup
 from sasgeo_bench.tasks.task_files import QUERIES, TRUTH, Task
 from tests import pose_files
 from tests.sensing import test_visual_odometry as plane
@@ -462,8 +462,36 @@ def test_photos_of_a_drone_need_no_table(towns, region, middle, tmp_path):
         assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.05)
         assert truth.pose.yaw_deg == pytest.approx(30.0 + north_of_grid(region, *middle), abs=0.01)
         assert str(query.observed_on) == "2024-05-01"
-    assert "left out: 1 picture (loose.jpg) without a position" in lines
+    assert any("(loose.jpg) without a position (say --poses or --track" in line for line in lines)
+    assert any(
+        line.startswith("places of 1 picture are good to less than 0.5 m, and taken as WGS 84") for line in lines
+    )
     assert any("(flat.jpg) whose camera is not known (it has no focal length" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("zones", "counts", "line"),
+    [
+        (("", ""), [6], ""),
+        (("+02:00", "+02:00"), [6], ""),
+        (("+02:00", "-05:00"), [3, 3], "clocks: photos of 2 zones, whose times are taken in UTC"),
+        (("+02:00", ""), [6], "clocks: 3 of 6 photos state no zone (EXIF's OffsetTimeOriginal): all are taken to"),
+    ],
+)
+def test_photos_of_several_zones_are_flights_by_utc(towns, region, middle, tmp_path, zones, counts, line):
+    """Six photos two seconds apart by their clocks, of which the last three may be of another camera."""
+    told = {"RelativeAltitude": "+80.0", "GimbalYawDegree": "30", "GimbalPitchDegree": "-90", "GimbalRollDegree": "0"}
+    for at in range(6):
+        taken = f"2024:05:01 10:20:{10 + 2 * at}{zones[at // 3]}"
+        gps = exif_of(region, offset(middle, 10 * at, 0))
+        (tmp_path / "photos").mkdir(exist_ok=True)
+        write_photo(tmp_path / "photos" / f"{at}.jpg", gps=gps, xmp=xmp_of(told), focal=24, taken=taken)
+    tasks, lines = quiet(
+        ImportRequest(pictures=tmp_path / "photos", region=towns / "regions" / TOWN, out=tmp_path / "out")
+    )
+    flown = [query.step.sequence_id for query in tasks[1].queries()]
+    assert sorted(flown.count(one) for one in set(flown)) == counts
+    assert [one[: len(line)] for one in lines if one.startswith("clocks")] == ([line] if line else [])
 
 
 def test_a_table_outdoes_the_file_but_not_a_picture_that_exif_turns(region, middle, laid):
@@ -584,6 +612,14 @@ def test_swapped_places_are_guessed_where_they_lie_on_the_map(region, middle, la
     cells[1:3] = cells[2:0:-1]
     with pytest.raises(ConfigError, match="longitude and latitude seem to be swapped"):
         quiet(laid([",".join(cells)]))
+    cells[1:3] = [str(math.radians(float(cell))) for cell in cells[2:0:-1]]
+    with pytest.raises(ConfigError, match="places seem to be in radians: call the columns lat_rad and lon_rad"):
+        quiet(laid([",".join(cells)]))
+    request = laid([",".join(cells)])
+    request.poses.write_text(request.poses.read_text().replace("lon,lat", "lon_rad,lat_rad"))
+    (task,), _ = quiet(request)
+    (truth,) = task.truths
+    assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.05)
 
 
 def test_altitudes_above_the_ellipsoid_are_no_heights_above_the_sea(region, middle, laid, tmp_path):
@@ -624,6 +660,7 @@ REFUSED = [
     ({"name": "My Photos"}, ConfigError, "is no name for a suite of your own"),
     ({"sigma_m": 0.0}, ConfigError, "--sigma lies above 0"),
     ({"seed": -1}, ConfigError, "--seed is 0 or more"),
+    ({"group": PriorGroup.parse("gnss")}, ConfigError, "for pictures take r50 or r100"),
     ({"region": Path("none")}, StoreError, "none"),
     ({"pictures": Path("none")}, ImageError, "there is no picture or folder none"),
     ({"poses": Path("none.csv")}, SasgeoError, "name a table of poses"),
@@ -663,7 +700,7 @@ def test_nothing_is_written_where_no_picture_is_left(region, middle, laid, tmp_p
 def test_the_most_frequent_reason_stands_for_those_that_were_told(region, middle, laid):
     far = [row(region, name, offset(middle, 5000, 0)) for name in ("a.png", "b.png")]
     rows = [*far, row(region, "c.png", middle, height=-3)]
-    with pytest.raises(ConfigError, match=r"2 pictures .* beside the map town-riverside, the others for the") as caught:
+    with pytest.raises(ConfigError, match=r"2 .* beside the map town-riverside .*, the others for the") as caught:
         quiet(laid(rows))
     assert "above the ground" not in str(caught.value)
 

@@ -2,6 +2,8 @@
 """Masks of other people's networks: values as they are stored, whatever the file does to show them."""
 
 import json
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +66,75 @@ def test_values_are_those_that_are_stored(tmp_path, write):
     found = read_mask(write(tmp_path), legend(VALUES))
     assert found.classes == ("road_major", "road_minor", "building")
     assert found.probability_bytes.tolist() == PLANES
+
+
+def png(cells: np.ndarray, bits: int, *, palette: bytes = b"", alpha: bytes = b"") -> bytes:
+    """A PNG by its specification: values packed from the left, whatever any library does with them."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    lines = b""
+    for row in cells:
+        digits = "".join(f"{value:0{bits}b}" for value in row)
+        digits += "0" * (-len(digits) % 8)
+        lines += b"\0" + bytes(int(digits[at : at + 8], 2) for at in range(0, len(digits), 8))
+    head = struct.pack(">IIBBBBB", cells.shape[1], cells.shape[0], bits, 3 if palette else 0, 0, 0, 0)
+    more = (chunk(b"PLTE", palette) if palette else b"") + (chunk(b"tRNS", alpha) if alpha else b"")
+    parts = chunk(b"IHDR", head) + more + chunk(b"IDAT", zlib.compress(lines)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts
+
+
+COLOURS = bytes([9, 9, 9, 250, 0, 0, 0, 250, 0, 0, 0, 250])
+
+
+KINDS = {
+    "grey": {},
+    "grey, 0 transparent": {"alpha": b"\0\0"},
+    "palette": {"palette": COLOURS},
+    "palette, 0 transparent": {"palette": COLOURS, "alpha": b"\0"},
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "bits"), [(kind, bits) for kind in KINDS for bits in (2, 4, 8, 16) if bits < 16 or "grey" in kind]
+)
+def test_a_png_of_any_depth_holds_what_its_bits_say(tmp_path, kind, bits):
+    (tmp_path / "a.png").write_bytes(png(CELLS, bits, **KINDS[kind]))
+    assert read_mask(tmp_path / "a.png", legend(VALUES)).probability_bytes.tolist() == PLANES
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 8, 16])
+@pytest.mark.parametrize("photometric", ["MINISBLACK", "MINISWHITE"])
+def test_a_tiff_of_any_depth_holds_what_its_bits_say(tmp_path, bits, photometric):
+    cells = (CELLS % 2 if bits == 1 else CELLS).astype(np.uint16 if bits == 16 else np.uint8)
+    path = write_tiff(tmp_path / "a.tif", cells[None], nbits=bits, photometric=photometric)
+    wanted = PLANES if bits > 1 else (cells[None] * 254).tolist()
+    meaning = VALUES if bits > 1 else '[values]\n0 = "none"\n1 = "building"'
+    assert read_mask(path, legend(meaning)).probability_bytes.tolist() == wanted
+
+
+def test_16_bits_are_neither_divided_nor_clipped(tmp_path):
+    cells = np.array([[0, 1, 255, 256, 1000, 65535]])
+    (tmp_path / "a.png").write_bytes(png(cells, 16))
+    meaning = '[values]\n0 = "none"\n1 = "water"\n255 = "unknown"\n256 = "building"\n1000 = "green"\n65535 = "unknown"'
+    found = read_mask(tmp_path / "a.png", legend(meaning))
+    assert found.classes == ("building", "water", "green")
+    assert found.probability_bytes[:, 0].T.tolist() == [
+        [0, 0, 0],
+        [0, 254, 0],
+        [255, 255, 255],
+        [254, 0, 0],
+        [0, 0, 254],
+        [255, 255, 255],
+    ]
+
+
+@pytest.mark.parametrize("bits", [2, 4, 8])
+def test_a_palette_is_the_legend_where_that_is_of_colours(tmp_path, bits):
+    (tmp_path / "a.png").write_bytes(png(CELLS, bits, palette=COLOURS, alpha=b"\xff\xff\xff\0"))
+    meaning = '[colours]\n"#090909" = "none"\n"#fa0000" = "building"\n"#00fa00" = ["road_major", "road_minor"]'
+    assert read_mask(tmp_path / "a.png", legend(meaning)).probability_bytes.tolist() == PLANES  # 3 is transparent
 
 
 def test_what_the_legend_does_not_name_is_unknown_and_counted(tmp_path):

@@ -279,6 +279,7 @@ NOON = dt.datetime(2025, 10, 2, 12, 8, 47, tzinfo=dt.UTC).timestamp()
     [
         ("DateTimeOriginal", "2025:10:02 12:08:47", NOON, "local"),
         ("SubSecDateTimeOriginal,DateTimeOriginal", "2025:10:02 12:08:47.25+08:00,x", NOON + 0.25 - 8 * 3600, "utc"),
+        ("time,x", "2025-10-02 12:08:47-03,x", NOON + 3 * 3600, "utc"),
         ("DateTimeOriginal,SubSecTimeOriginal,OffsetTime", "2025:10:02 12:08:47,25,-03:30", NOON + 0.25 + 12600, "utc"),
         ("timestamp", "2025-10-02T12:08:47Z", NOON, "utc"),
         ("GPSDateTime", "2025:10:02 12:08:47Z", NOON, "utc"),

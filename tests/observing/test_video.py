@@ -295,7 +295,7 @@ def test_each_fault_is_one_line(made: Made, filmed: Path, tmp_path: Path) -> Non
     path, out = plain.path, tmp_path / "out"
     faults: list[tuple[dict[str, object], type[SasgeoError], str]] = [
         ({"path": path}, FlightError, r"no track, such as DJI_0001.SRT beside it: say --track"),
-        ({"path": path, "track": empty}, FlightError, "holds no subtitles"),
+        ({"path": path, "track": empty}, FlightError, r"empty\.srt: empty: copy it anew"),
         ({"path": path, "track": tmp_path / "none.gpx"}, FlightError, "there is no flight log"),
         ({"path": path, "track": tum}, FlightError, "no longitude and latitude"),
         ({"path": path, "track": line}, FlightError, "has no times"),

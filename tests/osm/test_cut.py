@@ -64,6 +64,33 @@ def test_a_cut_holds_what_reaches_into_its_box_whole_and_nothing_else(village, t
     assert stated == pytest.approx(box(-100, -80, 100, 100), abs=1e-6)  # not beyond the extract's own
 
 
+def test_a_house_that_reaches_in_is_whole_wherever_its_way_begins(tmp_path):
+    """A tool that looks at the first node alone takes it or leaves it (osmium-tool 1.15, `extract -s simple`)."""
+    corners = [(90, 90), (110, 90), (110, 110), (90, 110)]  # of which one lies inside
+    turned = [[*corners[at:], *corners[:at], corners[at]] for at in range(4)]
+    village = osm(tmp_path / "a.osm", *((HOUSE, way) for way in turned), head=bounds(-200, -200, 200, 200))
+    cut_extract(village, tmp_path / "cut.osm.pbf", box(-100, -100, 100, 100))
+    nodes, ways, _ = ids(tmp_path / "cut.osm.pbf")
+    assert (len(nodes), ways) == (4, [1, 2, 3, 4])
+
+
+def test_what_is_left_of_houses_whose_nodes_were_dropped_is_counted_and_no_house(tmp_path):
+    """As `osmconvert --drop-broken-refs` leaves them: ways of one or two nodes, all of which are there."""
+    left = ([(40, 0), (60, 0)], [(80, 0)], [(40, 40), (60, 40), (40, 40)])
+    houses = [(HOUSE, way) for way in (square(0, 0, 20), *left)]
+    path = osm(tmp_path / "a.osm", *houses, head=bounds(-200, -200, 200, 200))
+    epsg = utm_epsg(*place(0, 0))
+    east_m, north_m = from_lonlat(epsg).transform(*place(0, 0))
+    grid = Grid(epsg=epsg, west_m=east_m - 100, north_m=north_m + 150, cell_size_m=1.0, rows=250, cols=250)
+    reading = read_extract(path, grid)
+    assert reading.features["osm_id"].tolist() == [1]
+    assert reading.drops == {
+        "way with fewer than two different nodes": 1,
+        "closed way with no closed ring left": 1,
+        "open way with the area key 'building', anywhere in the extract": 1,
+    }
+
+
 def test_a_history_is_cut_at_a_day_and_the_cut_is_of_one_state(tmp_path):
     old = tmp_path / "old.osh"
     meta = 'version="{}" visible="{}" timestamp="{}-01-01T00:00:00Z" changeset="1" uid="1" user="a"'

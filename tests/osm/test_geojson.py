@@ -5,6 +5,7 @@ import json
 
 import pytest
 import shapely
+import shapely.affinity
 
 from sasgeo_bench.core.config import check_document
 from sasgeo_bench.core.errors import ConfigError, CoverageError, ExtractError
@@ -72,6 +73,15 @@ def test_several_files_are_one_map_and_an_object_of_both_is_taken_once(tmp_path)
     reading = read(first, second)
     assert sorted(reading.features["osm_id"]) == [-2, 7, 8]
     assert reading.notes == {"feature without the id of an object": 1, "object that stands there twice, taken once": 1}
+
+
+def test_longitudes_beyond_180_are_refused_by_their_feature_and_never_wrapped_or_clamped(tmp_path):
+    away = feature(HOUSE)
+    away["geometry"] = shapely.geometry.mapping(shapely.affinity.translate(to_lonlat(HOUSE), xoff=181.0))
+    with pytest.raises(
+        ExtractError, match=r"feature 1 has a broken geometry \(its bounds \(190\.00.* are no longitudes"
+    ):
+        read(written(tmp_path / "a.geojson", feature(SHED), away))
 
 
 def test_a_crossing_ring_is_mended_and_a_feature_without_geometry_counted(tmp_path):

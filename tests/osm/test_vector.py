@@ -22,10 +22,9 @@ from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError, CoverageError, ExtractError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm import vector
-from sasgeo_bench.osm.locate import imagery_folders, named_files
+from sasgeo_bench.osm.locate import ClassTable, imagery_folders, named_files
 from sasgeo_bench.osm.read import read_vector
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.osm.vector import ClassTable
 from sasgeo_bench.regions.layers import burn
 
 EPSG, WEST, SOUTH, SIDE_M = 32632, 500_000.0, 5_210_000.0, 200

@@ -51,6 +51,7 @@ def test_a_centre_and_a_size_make_a_grid_of_that_size_around_it_and_bounds_one_t
         ("bounds_lonlat = [9.0, 84.5, 9.1, 84.6]", "84"),
         ("bounds_lonlat = [9.0, 47.0, 9.0, 47.1]", "positive size"),
         ("bounds_lonlat = [nan, 47.0, 9.0, 47.1]", "within -180..180"),
+        ("center_lonlat = [190.0, 47.0]\nsize_m = [100, 100]", "within -180..180"),
         ("bounds_lonlat = [0.0, 40.0, 12.0, 50.0]", "make it smaller"),
         ("center_lonlat = [9.0, 47.0]\nsize_m = [1e6, 1e6]", "GB each"),
         ("center_lonlat = [9.0, 47.0]\nsize_m = [-5, 100]", "positive"),
@@ -92,12 +93,14 @@ def test_the_newest_extract_is_picked_and_any_by_its_date():
 
 def test_a_region_that_new_region_wrote_is_found_by_its_name_after_those_of_the_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=r"there is no region 'my-town' \(list regions shows all\)"):
+    with pytest.raises(ConfigError, match=r"there is no region 'my-town' \(list regions or new-region\)"):
         find_region_file("my-town")
     own = OWN_FOLDER / "my-town.toml"
     own.parent.mkdir()
     own.write_text(text().replace('"mine"', '"my-town"'), encoding="utf-8")
     assert find_region_file("my-town") == own
+    with pytest.raises(ConfigError, match="there is no region 'my-twn', did you mean 'my-town'"):
+        find_region_file("my-twn")
     other = tmp_path / "others" / "my-town.toml"
     other.parent.mkdir()
     other.write_text(own.read_text(encoding="utf-8"), encoding="utf-8")

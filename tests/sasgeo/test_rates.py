@@ -3,10 +3,23 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import distance_transform_edt
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.regions.evidence import PRESENT
-from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, ClassRates, Tally, fit_rates, hand_rates, likeness, rings, tally
+from sasgeo_bench.sasgeo.rates import (
+    FAR,
+    NOWHERE,
+    RINGS_M,
+    ClassRates,
+    Tally,
+    fit_rates,
+    hand_rates,
+    likeness,
+    ring_of,
+    rings,
+    tally,
+)
 
 TRUE = ClassRates(hit=0.88, false_alarm=0.015, missing=0.04, vanish_per_year=0.02, appear_per_year=0.006, mapped=0.12)
 
@@ -95,3 +108,12 @@ def test_what_is_no_rate_is_refused(wrong, message):
     values = {name: getattr(TRUE, name) for name in TRUE.__slots__}
     with pytest.raises(ConfigError, match=message):
         ClassRates(**{**values, **wrong})
+
+
+@pytest.mark.parametrize("cell_size_m", [0.5, 1.0, 2.0, 3.0, 20.0])  # wide kernels and distances, small ones
+def test_rings_are_those_of_exact_distances(cell_size_m):
+    is_there = np.random.default_rng(5).random((90, 140)) < 0.004
+    distance_m = distance_transform_edt(~is_there) * cell_size_m
+    expected = np.digitize(distance_m, [0.0, *RINGS_M], right=True)
+    assert np.array_equal(ring_of(is_there, cell_size_m=cell_size_m), expected)
+    assert len(np.unique(expected)) > 1

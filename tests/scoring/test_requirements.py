@@ -18,6 +18,7 @@ from sasgeo_bench.scoring.requirements import (
     NOT_SHOWN,
     PASSES,
     compliance_frame,
+    flown_metric,
     own_metrics,
     parse_requirements,
     with_own,
@@ -60,6 +61,8 @@ from tests.scoring.test_tables import scores
             dict.fromkeys(("localization", "retrieval"), "risk_reached_at_0.01") | {"sequence": "false_of_accepted"},
         ),
         ("continuity_60s >= 99%", 0.99, True, {"sequence": "continuity_60s"}),
+        ("available_45s >= 90%", 0.9, True, {"sequence": "available_45s"}),
+        ("false_of_confirmed_5x10m <= 1%", 0.01, False, {"sequence": "false_of_confirmed_5x10m"}),
         ("position_p95 <= 30 m", 30.0, False, {"localization": "position_p95"}),
         ("fix_age_p95_s <= 1500 ms", 1.5, False, {"sequence": "fix_age_p95_s"}),
     ],
@@ -82,6 +85,7 @@ def test_a_text_says_which_figure_must_be_how_large(text, bound, is_least, figur
         ("80% within 200 deg", "is no limit"),
         ("180% within 50 m", "180 is no share, which is above 0 and at most 100 %"),
         ("p95 latency 400", "which is no requirement"),
+        ("p95 latency 0 ms", "no answer comes within 0 ms, give a time above 0"),
         ("false >= 1%", "'false' is no metric"),
         ("continuity_60 >= 99%", "'continuity_60' is no metric: did you mean 'continuity_60s'?"),
         ("latency_p95 <= 1 s", "a metric without an interval on each suite"),
@@ -234,3 +238,63 @@ def test_a_tracker_that_accepts_nothing_is_not_shown_to_be_right():
     (row,) = compliance_frame(requirements, board_of({"mine": scored.flights}, requirements)).to_dict("records")
     assert (row["figure"], row["accepted"], row["verdict"]) == (0.0, 0.0, NOT_SHOWN)
     assert row["figure_hi"] < 0.5  # of the interval alone it would pass
+
+
+def flights(seed=0):
+    """Rows of two flights' views by hand: times, fixes, the true way due north, and an exact odometer."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for name, count in (("a", 60), ("b", 40)):
+        for frame in range(count):
+            off_m = float(rng.choice([0.0, 12.0, 60.0]))
+            rows.append(
+                {"sequence_id": name, "time_s": 5.0 * frame, "distance_m": 50.0 * frame, "is_carried": False}
+                | {"is_accepted": bool(rng.random() < 0.6), "true_east_m": 0.0, "true_north_m": 50.0 * frame}
+                | {"true_yaw_deg": 0.0, "east_m": off_m, "north_m": 50.0 * frame, "yaw_deg": 0.0, "error_m": off_m}
+                | {"increment": None if frame == 0 else (0.0, 50.0, 0.0)}
+            )
+    return pd.DataFrame(rows)
+
+
+def test_constants_of_ones_own_are_those_of_the_name_of_a_figure():
+    views = flights()
+    values = {name: flown_metric(name).of_views(views) for name in ("available_12s", "continuity_25s")}
+    for name, part in views.groupby("sequence_id"):
+        fixes_s = part.loc[part["is_accepted"], "time_s"].to_numpy()
+        moments_s = np.arange(0, part["time_s"].max(), 0.01) + 0.005
+
+        def age(at_s, fixes_s=fixes_s):
+            at = np.searchsorted(fixes_s, at_s, side="right") - 1
+            return np.where(at >= 0, at_s - fixes_s[np.maximum(at, 0)], np.inf)
+
+        assert values["available_12s"][name] == pytest.approx(np.mean(age(moments_s) <= 12), abs=1e-3)
+        early_s = moments_s[moments_s <= part["time_s"].max() - 25]
+        has = age(early_s) <= 30
+        holds = np.all([age(early_s + more) <= 30 for more in np.arange(0, 25.01, 0.25)], axis=0)
+        assert values["continuity_25s"][name] == pytest.approx(np.mean(holds[has]), abs=0.01)
+
+
+@pytest.mark.parametrize(("count", "near_m"), [(2, 5), (3, 25), (4, 13)])
+def test_a_rule_of_ones_own_confirms_fixes_in_a_row_that_agree(count, near_m):
+    views = flights(1)
+    right = flown_metric(f"right_confirmed_{count}x{near_m}m").of_views(views)
+    false = flown_metric(f"false_of_confirmed_{count}x{near_m}m").of_views(views)
+    for name, part in views.groupby("sequence_id"):
+        fixes = [(at, row.east_m) for at, row in enumerate(part.itertuples()) if row.is_accepted]
+        # The odometer is exact and all head north: fixes agree if they are off alike.
+        confirmed = [
+            fixes[last]
+            for last in range(count - 1, len(fixes))
+            if all(abs(fixes[at][1] - fixes[at + 1][1]) <= near_m for at in range(last - count + 1, last))
+        ]
+        wrong = sum(off_m > 25 for _, off_m in confirmed)
+        assert right[name] == pytest.approx((len(confirmed) - wrong) / len(part))
+        assert false[name] == pytest.approx(wrong / max(1, len(confirmed)))
+
+
+@pytest.mark.parametrize(
+    "text", ["right_confirmed_1x5m >= 1%", "available_0s >= 1%", "false_of_confirmed_3x0m <= 1%", "available_s >= 1%"]
+)
+def test_a_constant_that_is_none_is_no_metric(text):
+    with pytest.raises(ConfigError, match="is no metric"):
+        parse_requirements([text])

@@ -14,7 +14,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
 from sasgeo_bench.search.dense import _Peaks
-from sasgeo_bench.search.field import FULL, Field, Template, between, warped
+from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
 from sasgeo_bench.search.find import Search, exhaustive, rank, score_at, search
 from sasgeo_bench.search.plan import Mode, Plan, all_around, posterior, thinned
 
@@ -324,3 +324,15 @@ def test_a_map_that_is_longer_than_opencv_warps_is_read_under_the_view(pose):
     left = int(np.clip(pose[0] - 100, 0, 32_700))
     part = Grid(epsg=0, west_m=float(left), north_m=64.0, cell_size_m=1.0, rows=64, cols=300)
     np.testing.assert_array_equal(found, warped(long[:, left : left + 300], between(frame, at, part), (32, 32)))
+
+
+@pytest.mark.parametrize("pool", range(1, 10))
+def test_squares_of_a_view_sum_to_the_last_bit_as_numpy_does(pool):
+    bands = np.random.default_rng(pool).standard_normal((3, 37, 41)).astype(np.float32)
+    found, frame = squares(bands, pool, cell_size_m=0.5)
+    down, across = -37 % pool, -41 % pool
+    wide = np.pad(bands, ((0, 0), (down // 2, down - down // 2), (across // 2, across - across // 2)))
+    parts = wide.reshape(3, wide.shape[1] // pool, pool, wide.shape[2] // pool, pool)
+    assert found.dtype == np.float32
+    assert np.array_equal(found, parts.sum(axis=(2, 4)))
+    assert found.shape[1:] == frame.shape

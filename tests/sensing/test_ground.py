@@ -2,10 +2,13 @@
 """Planes and heights out of GeoTIFFs: where rays meet them, and what is refused."""
 
 import os
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
 import rasterio
+import tifffile
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -47,6 +50,28 @@ def test_a_ray_to_a_slope_meets_it_where_geometry_says(east, north, right, up):
         assert np.allclose(met, expected, rtol=1e-7, atol=1e-4)
     elif not (-0.1 <= expected[0] <= 120.1 and -0.1 <= expected[1] <= 100.1):
         assert np.isnan(met).all()
+
+
+@pytest.mark.parametrize("kind", ["Area", "Point"])
+def test_heights_lie_where_gdal_says_whether_a_pixel_is_an_area_or_a_point(kind, tmp_path):
+    """Of a point the tie is the middle of the first pixel: half a pixel to the south-east of its corner."""
+    path, first = tmp_path / "a.tif", np.arange(120, dtype=np.float32).reshape(10, 12)
+    program = shutil.which("gdal_translate")
+    if program is None:
+        pytest.skip("gdal_translate is not on this machine")
+    write_dem(tmp_path / "raw.tif", Dem(grid=GRID, cells_m=first))
+    tie = [f"{GRID.west_m}", f"{GRID.north_m}", f"{GRID.west_m + 120}", f"{GRID.north_m - 100}"]
+    options = ["-a_ullr", *tie, "-mo", f"AREA_OR_POINT={kind}", str(tmp_path / "raw.tif"), str(path)]
+    subprocess.run([program, *options], check=True, capture_output=True)  # noqa: S603 - our own arguments
+    with tifffile.TiffFile(path) as file:  # the tag as it is stored, and the point that is tied
+        told = file.pages[0].tags["GeoKeyDirectoryTag"].value
+        tied_m = file.pages[0].tags["ModelTiepointTag"].value
+    raster_type = next(told[at + 3] for at in range(4, len(told), 4) if told[at] == 1025)
+    assert raster_type == (2 if kind == "Point" else 1)
+    half_m = 5.0 if kind == "Point" else 0.0
+    assert tied_m[3:5] == (GRID.west_m + half_m, GRID.north_m - half_m)
+    inner = Grid(epsg=32632, west_m=GRID.west_m + 20, north_m=GRID.north_m - 20, cell_size_m=10.0, rows=4, cols=4)
+    np.testing.assert_allclose(read_dem(path, inner).cells_m, first[2:6, 2:6])
 
 
 def test_a_ray_stops_at_the_hill_in_front_and_a_camera_under_ground_sees_none():

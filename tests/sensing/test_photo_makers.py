@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Photos of many makers and kinds: their angles, sizes and focal lengths mean one thing, or are refused by name."""
 
+import datetime as dt
 import json
 import math
 import shutil
@@ -328,8 +329,12 @@ def test_a_damaged_tiff_is_refused_on_one_line(content, tmp_path):
 @pytest.mark.skipif(not shutil.which("exiftool"), reason="exiftool is not installed")
 @pytest.mark.parametrize("kind", ["JPEG", "TIFF"])
 def test_exiftool_reads_the_same(kind, tmp_path):
-    facts = CALIBRATED | {"GimbalYawDegree": "-12.30", "FlightYawDegree": "4.5", "AbsoluteAltitude": "+512.3"}
+    flown = {"FlightYawDegree": "+4.5", "FlightPitchDegree": "-3.25", "FlightRollDegree": "+1.75"}
+    facts = CALIBRATED | {"GimbalYawDegree": "-12.30", "GimbalRollDegree": "+0.5", "AbsoluteAltitude": "+512.3"} | flown
     inner = dict(zip(PIXELS, FULL, strict=True)) | {ZOOM: 1.5, ExifTags.Base.FocalLength: 8.8}
+    inner[ExifTags.Base.DateTimeOriginal] = "2024:05:01 10:20:30"
+    inner[ExifTags.Base.SubsecTimeOriginal] = "25"
+    inner[ExifTags.Base.OffsetTimeOriginal] = "-04:30"
     path = write(tmp_path / "a", packet_of(part_of(DJI, facts, prefix="drone-dji")), kind=kind, make="DJI", inner=inner)
     command = [str(shutil.which("exiftool")), "-n", "-j", str(path)]
     run = subprocess.run(command, capture_output=True, check=True)  # noqa: S603 - ours
@@ -340,7 +345,13 @@ def test_exiftool_reads_the_same(kind, tmp_path):
         pytest.approx(tags["GPSLatitude"]),
     )
     assert (photo.height_m, photo.altitude_m) == (tags["RelativeAltitude"], float(tags["AbsoluteAltitude"]))
-    assert (photo.gimbal.yaw_deg, photo.gimbal.pitch_deg) == (tags["GimbalYawDegree"], tags["GimbalPitchDegree"])
+    for name, body in (("Gimbal", photo.gimbal), ("Flight", photo.flight)):
+        found = {"Yaw": body.yaw_deg, "Pitch": body.pitch_deg, "Roll": body.roll_deg}
+        assert found == {axis: float(tags[f"{name}{axis}Degree"]) for axis in found}
+    whole = dt.datetime.strptime(tags["SubSecDateTimeOriginal"], "%Y:%m:%d %H:%M:%S.%f%z")
+    assert photo.taken_at == whole.replace(tzinfo=None)
+    assert photo.utc_offset == whole.utcoffset()
+    assert (photo.taken_at.microsecond, photo.utc_offset) == (250_000, dt.timedelta(hours=-4, minutes=-30))
     assert (photo.width_px, photo.height_px) == (tags["ImageWidth"], tags["ImageHeight"])
     lens = photo.lens
     assert (lens.calibrated_px, lens.zoom) == (tags["CalibratedFocalLength"], tags["DigitalZoomRatio"])

@@ -36,13 +36,19 @@ ZURICH = {
 }
 
 
+TAKEN = "2024:05:01 10:20:30"
+
+
 def xmp_of(pose, *, as_elements=False):
     attributes = " ".join(f'drone-dji:{name}="{value}"' for name, value in pose.items())
     elements = "".join(f"<drone-dji:{name}>{value}</drone-dji:{name}>" for name, value in pose.items())
     return XMP.format(attributes="" if as_elements else attributes, elements=elements if as_elements else "")
 
 
-def write_photo(path, *, gps=ZURICH, xmp=xmp_of(POSE), focal=20, orientation=None, size=(400, 300)):  # noqa: B008
+DRONES = xmp_of(POSE)
+
+
+def write_photo(path, *, gps=ZURICH, xmp=DRONES, focal=20, orientation=None, size=(400, 300), taken=TAKEN):
     """A photo of nothing, with the metadata of a drone's."""
     exif = Image.Exif()
     if orientation is not None:
@@ -50,7 +56,9 @@ def write_photo(path, *, gps=ZURICH, xmp=xmp_of(POSE), focal=20, orientation=Non
     exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
     if focal:
         exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal
-    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.DateTimeOriginal] = "2024:05:01 10:20:30"
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.DateTimeOriginal] = taken[:19]
+    if zone := taken[19:]:
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.OffsetTimeOriginal] = zone
     Image.new("L", size).save(path, format="JPEG", exif=exif, xmp=xmp.encode())
     return path
 
@@ -174,7 +182,7 @@ def test_what_is_no_photo_is_refused(photo_path):
         read_photo(photo_path)
     for content in (b"", b"\xff\xd8\xff\xe0 and no more", b"GIF89a"):
         photo_path.write_bytes(content)
-        with pytest.raises(ImageError, match=r"no JPEG|damaged"):
+        with pytest.raises(ImageError, match=r"no JPEG|damaged|is empty: copy it again"):
             read_photo(photo_path)
 
 

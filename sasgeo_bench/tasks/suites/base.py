@@ -309,8 +309,10 @@ class Suite(ABC):
         """Return whether the disc of a localization query must hold the twins of its site."""
         return False
 
-    def refusal(self, group: PriorGroup) -> str | None:  # noqa: ARG002
+    def refusal(self, group: PriorGroup) -> str | None:
         """Return why a prior group of the user does not fit this suite, or None."""
+        if group.is_gnss and "sequence" not in self.card.tracks:
+            return f"has no flights, of which prior group {group.name} is: use r50 or r100 for weak GNSS"
         return "is about what is known before: leave --prior out" if self.card.has_own_priors else None
 
     def fitting(self, largest_m: float | None) -> tuple[Variant, ...]:

@@ -61,6 +61,9 @@ class Mission:
         control's step, as if nothing had happened.
     draw : str
         Names other draws of perception and odometry: variants of one name have the same.
+    takes_log : bool
+        Whether odometry of the log of a flight that was flown takes the place of what is drawn by the profile, where it
+        has some, and a profile of one's own that of this one. A variant that is about a profile keeps it.
     """
 
     profile: str = "vo-mono-survey"  # profile of the odometer where a suite is not about drift
@@ -71,6 +74,7 @@ class Mission:
     carried_m: float = 0.0
     is_lost: bool = False
     draw: str = ""
+    takes_log: bool = True
 
 
 def uneventful(variant: Variant) -> Mission:
@@ -83,10 +87,12 @@ def uneventful(variant: Variant) -> Mission:
 class FlightSuite(Suite):
     """A suite of flights: all variants at a site fly the same way, and `mission` says what happens on it.
 
-    `every_m` are the bounds of a flight's mean spacing of views, and `longest_m` of its length.
+    `every_m` are the bounds of a flight's mean spacing of views, and `longest_m` of its length. Variants `of_own` are
+    added on a flight that was flown with an odometer of its own: that of its log, or of a profile that was measured.
     """
 
     mission: Callable[[Variant], Mission] = uneventful
+    of_own: tuple[Variant, ...] = ()
     every_m: tuple[float, float] = SPACING_M
     longest_m: float = max(LENGTHS_M)
 
@@ -441,12 +447,15 @@ FLIGHT_ALIAS: Final = FlightAliasSuite(
 
 PROFILES: Final = ("vo-mono-survey", "wheel-poor", "vio-stereo", "vio-mono")  # by their drift after kilometres
 _KIND: Final = "F1"
+_OWN: Final = f"{_KIND} own odometer"
 
 
 def _clean_mission(variant: Variant) -> Mission:
+    if variant.kind == _OWN:
+        return Mission()
     if variant.role == "stress":
-        return Mission(profile=variant.kind.removeprefix(f"{_KIND} "))
-    return Mission(profile="perfect", draw=AGAIN if variant.role == "falsifier" else "")
+        return Mission(profile=variant.kind.removeprefix(f"{_KIND} "), takes_log=False)
+    return Mission(profile="perfect", draw=AGAIN if variant.role == "falsifier" else "", takes_log=False)
 
 
 FLIGHT_CLEAN: Final = FlightSuite(
@@ -472,6 +481,7 @@ FLIGHT_CLEAN: Final = FlightSuite(
         Variant(role="falsifier", kind="no drift again"),
     ),
     mission=_clean_mission,
+    of_own=(Variant(role="stress", kind=_OWN, strength=float(len(PROFILES) + 1)),),
 )
 
 

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two commits side by side: whole processes as a user types them, base and head in turn, medians and their ratio.
+
+    python benchmarks/side_by_side.py d52d0bcd HEAD --into out/side-by-side
+    python benchmarks/side_by_side.py d52d0bcd HEAD --into out/side-by-side --rows build sasgeo --runs 3
+
+Checks both commits out below `--into`, makes an environment for each by its own `make install`, and runs each row in
+each of them in turn, base first: A B A B. What a row needs (regions, tasks) each commit makes for itself, once. Seconds
+are by the clock, `CPU s` are of a command and of all that it waited for, memory is that of its largest process; rows of
+`profile` give what it measured of the matcher. A ratio is head over base. Other load is in the seconds of both alike,
+and least in `CPU s`: quote ratios of one run. A row that one of the commits cannot carry out says so; rows that were
+measured are kept, and the same command goes on with the others. Needs the extracts of Liechtenstein, Andorra and the
+Faroes in a folder that SASGEO_EXTRACTS names.
+"""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+HERE: Final = Path(__file__).resolve().parents[1]
+FRESH: Final = "{fresh}"  # a folder that is emptied before each run
+KEPT: Final = "{kept}"  # a folder of the commit, in which its regions and tasks stay
+PLACES: Final = {  # name -> region whose extracts it has, and what its file says otherwise
+    "square": ("vaduz", {"id": '"square"', "size_m": "[12288, 12288]"}),
+    "faroes": ("torshavn", {"id": '"faroes"', "center_lonlat": "[-6.97, 61.895]", "size_m": "[81920, 120832]"}),
+}
+VADUZ: Final = ("build-region", "vaduz", "--out", KEPT)
+
+
+def drawn(suite: str, *, sites: int) -> tuple[str, ...]:
+    """Return the words that draw a suite on Vaduz."""
+    return ("make-queries", "--suite", suite, "--regions", "vaduz", "--n", str(sites), "--out", KEPT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A command of the program, or a program of ours (`*.py`), and what must be there before.
+
+    `is_profile` takes figures from `profile.json` in place of those of the process.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    first: tuple[tuple[str, ...], ...] = ()
+    goal: float | None = None
+    is_profile: bool = False
+
+
+def profiled(name: str, matcher: str, *, goal: float, suite: str = "clean") -> Row:
+    """Return the row of one matcher over Vaduz, discs of 500 m at most."""
+    asked = ("--radius", "600") if suite == "clean" else ()
+    words = (
+        "profile",
+        "--matcher",
+        matcher,
+        "--tasks",
+        f"{KEPT}/tasks/{suite}/vaduz",
+        "--out",
+        KEPT,
+        "--seconds",
+        "20",
+    )
+    first = (VADUZ, drawn(suite, sites=3))
+    return Row(name=name, words=(*words, "--into", FRESH, *asked), first=first, goal=goal, is_profile=True)
+
+
+ROWS: Final = (
+    Row(name="help", words=("--help",), goal=1.0),
+    Row(name="build 16 km2", words=("build-region", "vaduz", "--out", FRESH), goal=0.4),
+    Row(name="build 144 km2", words=("build-region", f"{KEPT}/square.toml", "--out", FRESH), goal=0.5),
+    Row(name="build Faroes", words=("build-region", f"{KEPT}/faroes.toml", "--out", FRESH), goal=0.5),
+    profiled("sasgeo_prior", "sasgeo_prior", goal=0.45),
+    profiled("raster_soft", "raster_soft", goal=0.4),
+    profiled("hu_map_only", "hu_map_only", goal=0.4),
+    profiled("ubev_template", "ubev_template", goal=0.4),
+    profiled("sasgeo_track", "sasgeo_track", goal=0.5, suite="flight-clean"),
+    *(
+        Row(
+            name=f"draw {suite}",
+            words=("make-queries", "--suite", suite, "--regions", "vaduz", "--n", str(sites), "--out", KEPT),
+            first=(VADUZ,),
+            goal=0.5,
+        )
+        for suite, sites in (("clean", 36), ("aerial", 40), ("flight-clean", 4))
+    ),
+    Row(name="render", words=("benchmarks/rendering.py", "--out", KEPT), goal=0.4),
+    Row(
+        name="score 10^5 rows",
+        words=("benchmarks/score.py", "--sizes", "10x10000", "--runs", "1", "--keep", f"{KEPT}/made-up"),
+        first=(("benchmarks/score.py", "--sizes", "10x10000", "--runs", "1", "--keep", f"{KEPT}/made-up"),),
+        goal=0.3,
+    ),
+    Row(name="make demo", words=("make", "demo"), goal=0.6),
+    Row(name="make test", words=("make", "test"), goal=0.65),
+)
+
+
+@dataclass(frozen=True)
+class Checkout:
+    """A commit, checked out and installed."""
+
+    name: str
+    root: Path
+
+    @classmethod
+    def of(cls, name: str, commit: str, into: Path) -> "Checkout":
+        """Check a commit out and install it, unless that is done."""
+        made = cls(name, into / name)
+        if not made.root.exists():
+            git("worktree", "add", "--force", "--detach", str(made.root), commit)
+        if not (made.root / ".venv" / "installed").exists():
+            with (into / f"{name}.log").open("ab") as said:
+                subprocess.run(["make", "install"], cwd=made.root, check=True, stdout=said, stderr=said)  # noqa: S607
+            (made.root / ".venv" / "installed").touch()
+        made.kept.mkdir(exist_ok=True)
+        for place, (region, changes) in PLACES.items():
+            text = (HERE / "regions" / f"{region}.toml").read_text()
+            for key, value in changes.items():
+                text = re.sub(f"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
+            (made.kept / f"{place}.toml").write_text(text)
+        return made
+
+    @property
+    def kept(self) -> Path:
+        """Return the folder of its regions and tasks."""
+        return self.root.parent / f"{self.name}-kept"
+
+    def measured(self, row: Row) -> dict[str, float]:
+        """Carry out a row once; return its figures by name."""
+        fresh = self.root.parent / f"{self.name}-fresh"
+        shutil.rmtree(fresh, ignore_errors=True)
+        begun = time.perf_counter()
+        process = self._begin(row.words, fresh)
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - begun
+        if status:
+            raise subprocess.CalledProcessError(os.waitstatus_to_exitcode(status), row.words)
+        if row.is_profile:
+            return of_profile(json.loads(next(fresh.rglob("profile.json")).read_text()))
+        return {"s": seconds, "CPU s": usage.ru_utime + usage.ru_stime, "MB": usage.ru_maxrss * 1024 / 1e6}
+
+    def prepare(self, row: Row) -> None:
+        """Make what a row needs."""
+        for words in row.first:
+            process = self._begin(words, self.root.parent / f"{self.name}-fresh")
+            if process.wait():
+                raise subprocess.CalledProcessError(process.returncode, words)
+
+    def _begin(self, words: Sequence[str], fresh: Path) -> "subprocess.Popen[bytes]":
+        given = [word.replace(FRESH, str(fresh)).replace(KEPT, str(self.kept)) for word in words]
+        binaries = self.root / ".venv" / "bin"
+        if given[0].endswith(".py"):
+            given = [str(binaries / "python"), *given]
+        elif given[0] != "make":
+            given = [str(binaries / "sasgeo-bench"), *given]
+        path = {"PATH": f"{binaries}:{os.environ['PATH']}", "PYTHONPATH": str(self.root)}
+        said = (self.root.parent / f"{self.name}.log").open("ab")
+        return subprocess.Popen(given, cwd=self.root, env=os.environ | path, stdout=said, stderr=said)  # noqa: S603 - our own programs
+
+
+def of_profile(found: Mapping[str, object]) -> dict[str, float]:
+    """Return the figures of a profile.
+
+    >>> fixes = [{"status": "ok", "seconds": 0.2, "cpu_s": 0.1}] * 20
+    >>> of_profile({"fixes": fixes, "start_s": 1.0, "prepare_s": 2.0, "peak_bytes": 3e8})["p95 s"]
+    0.2
+    """
+    fixes = [fix for fix in found["fixes"] if fix["status"] == "ok"]  # type: ignore[attr-defined]
+    times = sorted(fix["seconds"] for fix in fixes)
+    return {
+        "p50 s": statistics.median(times),
+        "p95 s": times[int(0.95 * (len(times) - 1))],
+        "CPU s": statistics.median(fix["cpu_s"] for fix in fixes),
+        "start s": float(str(found["start_s"])),
+        "prepare s": float(str(found["prepare_s"])),
+        "MB": float(str(found["peak_bytes"])) / 1e6,
+    }
+
+
+def git(*words: str) -> str:
+    """Ask git."""
+    return subprocess.run(["git", *words], cwd=HERE, check=True, capture_output=True, text=True).stdout.strip()  # noqa: S603, S607
+
+
+def medians(runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the median of each figure.
+
+    >>> medians([{"s": 1.0}, {"s": 3.0}, {"s": 2.0}])
+    {'s': 2.0}
+    """
+    return {name: statistics.median(run[name] for run in runs) for name in runs[0]}
+
+
+def table(found: Mapping[str, Mapping[str, Sequence[Mapping[str, float]]]]) -> str:
+    """Return the rows that were measured as a table in Markdown.
+
+    >>> print(table({"help": {"base": [{"s": 0.2}], "head": [{"s": 0.1}]}}))
+    | row | figure | base | head | ratio | goal |
+    |---|---|---:|---:|---:|---:|
+    | help | s | 0.20 | 0.10 | 0.50 | 1.00 |
+    """
+    goals = {row.name: row.goal for row in ROWS}
+    lines = ["| row | figure | base | head | ratio | goal |", "|---|---|---:|---:|---:|---:|"]
+    for name, runs in found.items():
+        if not all(runs.get(side) for side in ("base", "head")):
+            lines.append(f"| {name} | not carried out by {' and '.join(s for s in runs if not runs[s])} | | | | |")
+            continue
+        base, head = (medians(runs[side]) for side in ("base", "head"))
+        for at, figure in enumerate(base):
+            goal = goals.get(name)
+            told = f"{goal:.2f}" if goal and at == 0 else ""
+            ratio = head[figure] / base[figure] if base[figure] else float("nan")
+            shown = f"{base[figure]:.2f} | {head[figure]:.2f} | {ratio:.2f}"
+            lines.append(f"| {name if at == 0 else ''} | {figure} | {shown} | {told} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure the rows that are asked for and not yet measured; print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("base", help="commit to measure against")
+    parser.add_argument("head", help="commit to measure")
+    parser.add_argument("--into", type=Path, default=Path("out/side-by-side"), help="folder for checkouts and figures")
+    parser.add_argument("--rows", nargs="*", default=[""], help="beginnings of names of rows; default: all")
+    parser.add_argument("--runs", type=int, default=5, help="runs of each row in each commit")
+    asked = parser.parse_args()
+    into = asked.into.resolve()
+    into.mkdir(parents=True, exist_ok=True)
+    commits = {"base": git("rev-parse", asked.base), "head": git("rev-parse", asked.head)}
+    sides = {name: Checkout.of(f"{name}-{commit[:8]}", commit, into) for name, commit in commits.items()}
+    kept = into / f"{commits['base'][:8]}-{commits['head'][:8]}.json"
+    found = json.loads(kept.read_text()) if kept.exists() else {}
+    for row in ROWS:
+        if row.name in found or not any(row.name.startswith(word) for word in asked.rows):
+            continue
+        runs: dict[str, list[dict[str, float]]] = {name: [] for name in sides}
+        for run in range(asked.runs):
+            for name, side in sides.items():
+                try:
+                    if run == 0:
+                        side.prepare(row)
+                    elif not runs[name]:
+                        continue
+                    runs[name].append(side.measured(row))
+                except (subprocess.CalledProcessError, StopIteration) as error:
+                    print(f"{row.name} in {name}: {error}; see {into}/{side.name}.log", file=sys.stderr)
+                    runs[name] = []
+        found[row.name] = runs
+        kept.write_text(json.dumps(found, indent=1))
+        print(f"{row.name}: done", file=sys.stderr)
+    print(table(found))
+
+
+if __name__ == "__main__":
+    main()

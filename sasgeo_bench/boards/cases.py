@@ -56,7 +56,8 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.regions.evidence import CERTAIN, UNKNOWN, Evidence, LayerBits, footprint, observe
 from sasgeo_bench.regions.layers import PRESENT
-from sasgeo_bench.regions.preview import GROUND, HIDDEN, class_keys, paint_evidence, paint_overview, pooled, scale_bar
+from sasgeo_bench.regions.painting import GROUND, HIDDEN, paint_evidence, paint_overview, pooled
+from sasgeo_bench.regions.preview import class_keys, scale_bar
 from sasgeo_bench.regions.region import Manifest, Region
 from sasgeo_bench.scoring.base import Bools
 from sasgeo_bench.scoring.contrasts import Contrast

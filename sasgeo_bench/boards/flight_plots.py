@@ -36,7 +36,8 @@ from sasgeo_bench.core.errors import ConfigError, StoreError, check_given, count
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.preview import HIDDEN, scale_bar
+from sasgeo_bench.regions.painting import HIDDEN
+from sasgeo_bench.regions.preview import scale_bar
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.scoring.flights import DRIFT_M, RECKONED_M
 from sasgeo_bench.scoring.score import FIX_M

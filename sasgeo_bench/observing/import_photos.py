@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.core.errors import ConfigError, SasgeoError, counted, named
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, counted, named
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import NAME, plain
 from sasgeo_bench.geometry.pose import Prior
@@ -329,9 +329,19 @@ class TaskWriter:
 
     def put(self, suite: str, pairs: Callable[[str], Pairs], of: Sequence[PosedPicture], more: str = "") -> Task:
         """Write one task; `more` is a sentence on what it is."""
+        before = self._queries_sha256(suite)
         made = put_task(pairs(suite), self._origin(suite, of, more), self._hidden(len(of)), out=self.request.out)
+        if before not in (None, made.manifest.queries_sha256):
+            tell(f"{made.folder} held the queries of another import, which are replaced (another --name keeps both)")
         tell(f"{suite} on {self.state.region}: {counted(made.manifest.queries, 'query', 'queries')} in {made.folder}")
         return made
+
+    def _queries_sha256(self, suite: str) -> str | None:
+        """Return the hash of the queries of that name that are there already; None without sound ones."""
+        try:
+            return Task.open(self.request.out / "tasks" / suite / self.state.region).manifest.queries_sha256
+        except StoreError:
+            return None
 
     def _hidden(self, count: int) -> TruthManifest:
         return TruthManifest.model_validate(seed_record(self.request.seed) | {"count": count})
@@ -355,6 +365,8 @@ class TaskWriter:
             map_date=self.state.date.isoformat(),
             map_fingerprint=self.manifest.fingerprint,
             map_inputs_sha256=self.manifest.inputs_sha256,
+            licence=self.manifest.licence,
+            attribution=self.manifest.attribution,
             provenance=self.manifest.provenance,
             sites=len(pictures),
             epsg=self.manifest.epsg,

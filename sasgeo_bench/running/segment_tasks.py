@@ -24,7 +24,7 @@ from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frame_evidence import evidence_of, for_classes
-from sasgeo_bench.tasks.frames import read_labels
+from sasgeo_bench.tasks.frame_files import read_labels
 from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of, view_id
 from sasgeo_bench.tasks.segmented import Segmented, segmented_file, write_segmented
 from sasgeo_bench.tasks.split import HALVES, Split

@@ -16,7 +16,6 @@ import shapely
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
@@ -30,7 +29,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.layers import read_layers, read_overview
-from sasgeo_bench.regions.preview import GROUND, HIDDEN, paint_evidence, paint_overview
+from sasgeo_bench.regions.painting import GROUND, HIDDEN, paint_evidence, paint_overview, rgb_of
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
 from sasgeo_bench.tasks.build import rebuild_hint
 from sasgeo_bench.tasks.flight_sampling import UTC
@@ -83,11 +82,11 @@ def paint_difference(seen: Evidence, mapped: Evidence) -> NDArray[np.float64]:
     known = (seen.cells != UNKNOWN) & (mapped.cells != UNKNOWN)
     one, two = (known & (item.cells == PRESENT) for item in (seen, mapped))
     picture = np.empty((*seen.shape, 3))
-    picture[:] = to_rgb(GROUND)
-    picture[(one & two).any(axis=0)] = to_rgb(AGREE)
-    picture[(two & ~one).any(axis=0)] = to_rgb(ONLY_MAPPED)
-    picture[(one & ~two).any(axis=0)] = to_rgb(ONLY_SEEN)
-    picture[~known.any(axis=0)] = to_rgb(HIDDEN)
+    picture[:] = rgb_of(GROUND)
+    picture[(one & two).any(axis=0)] = rgb_of(AGREE)
+    picture[(two & ~one).any(axis=0)] = rgb_of(ONLY_MAPPED)
+    picture[(one & ~two).any(axis=0)] = rgb_of(ONLY_SEEN)
+    picture[~known.any(axis=0)] = rgb_of(HIDDEN)
     return picture
 
 

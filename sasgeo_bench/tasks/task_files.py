@@ -30,7 +30,7 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, Evidence, pack, unpack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest, Provenance
 from sasgeo_bench.regions.region_files import read_manifest
-from sasgeo_bench.tasks.frames import FRAME, LABEL_SCHEMA, LABELS, frame_of, frame_row, label_row
+from sasgeo_bench.tasks.frame_files import FRAME, LABEL_SCHEMA, LABELS, frame_of, frame_row, label_row
 from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, TASK_VERSIONS, Head, Query, Step, Truth
 
 if TYPE_CHECKING:
@@ -463,6 +463,11 @@ class TaskOrigin(Document):
         return self.suite, self.region
 
     @property
+    def credit(self) -> str:
+        """Return whom to name beside what is made of the map: all that it was made of."""
+        return self.attribution or self.provenance.credit
+
+    @property
     def map_hashes(self) -> dict[str, str]:
         """Hashes of the contents and the inputs of the searched map, as far as they are recorded."""
         found = {"map_fingerprint": self.map_fingerprint, "map_inputs_sha256": self.map_inputs_sha256}
@@ -758,12 +763,10 @@ def write_task(
     frozen = hashlib.sha256()
     frames = 0
     labels: Any = None  # a writer, opened at the first picture
-    credit = origin.provenance.credit
+    terms = {"licence": origin.licence or LICENCE, "attribution": origin.credit}
     with ExitStack() as stack:
         queries, truths = (
-            stack.enter_context(
-                table_writer(path, schema.with_metadata(_META | {"attribution": credit}), compression_level=9)
-            )
+            stack.enter_context(table_writer(path, schema.with_metadata(_META | terms), compression_level=9))
             for path, schema in ((task_folder / QUERIES, FILE_SCHEMA), (truth_folder / TRUTH, TRUTH_SCHEMA))
         )
         for part in _batches(pairs):
@@ -787,14 +790,13 @@ def write_task(
     content = {
         "schema_version": SCHEMA_VERSION,
         "task_version": TASK_VERSION,
-        **origin.model_dump(mode="json", exclude_unset=True),
+        **origin.model_dump(mode="json", exclude_unset=True, exclude={*terms}),
         "counts": dict(counts),
         "prior_groups": sorted(groups),
         "candidates_sha256": frozen.hexdigest(),
         **({"frames": frames} if frames else {}),
         "files": {QUERIES: record.model_dump()},
-        "licence": LICENCE,
-        "attribution": credit,
+        **terms,
     }
     more = {} if hidden is None else hidden.model_dump(mode="json", exclude_unset=True, exclude={"queries_sha256"})
     _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **more})

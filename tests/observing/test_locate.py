@@ -330,6 +330,7 @@ def test_an_answer_is_kept_for_its_own_words_alone(towns, pictures):
         {"heading": (10.0, 5.0)},
         {"is_turned": True},
         {"told": Told(height_m=50.0)},
+        {"told": Told(dem=pictures / "a.tif")},
         {"uses_position": False},
         {"most_false": 0.1},
     )
@@ -341,10 +342,12 @@ def test_an_answer_is_kept_for_its_own_words_alone(towns, pictures):
 def test_an_answer_says_why_it_is_withheld():
     prior = sgb.Prior(center_m=(0.0, 0.0), radius_m=500.0, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
     answer = Prediction(query_id="q", diagnostics={"modes_above": 3.0})
-    assert verdict(answer, 0.05, prior, 0.05) == ("found", "")
-    assert verdict(answer, 0.3, prior, 0.05) == ("withheld", "2 other places within 500 m look alike")
-    assert verdict(answer, 0.9, prior, 0.05)[0] == "not on this map"
-    assert verdict(answer, None, prior, 0.05)[0] == "withheld"
+    how = {"side_m": 156.9, "most_false": 0.05}
+    assert verdict(answer, 0.05, prior, **how) == ("found", "")
+    assert verdict(answer, 0.3, prior, **how) == ("withheld", "2 other places within 500 m look alike")
+    nowhere = ("not on this map", "no place within 500 m explains what is seen, taken as 157 m wide")
+    assert verdict(answer, 0.9, prior, **how) == nowhere
+    assert verdict(answer, None, prior, **how)[0] == "withheld"
 
 
 FIXES = (

@@ -17,7 +17,7 @@ from matplotlib.colors import to_rgb
 from sasgeo_bench.core.canvas import DPI
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import GROUND, HIDDEN
+from sasgeo_bench.regions.painting import GROUND, HIDDEN
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.tasks.query import TRUTH_SIGMA, Query, Truth
 from sasgeo_bench.tasks.sheet import (

@@ -27,7 +27,7 @@ from sasgeo_bench.flights.kinematics import crab_deg, fly, tilt_deg, yaw_rate_de
 from sasgeo_bench.flights.plans import KINDS, PlanKind, Ways, plan_flight
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.regions.build import build_region, plan_build
-from sasgeo_bench.regions.preview import paint_overview
+from sasgeo_bench.regions.painting import paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file

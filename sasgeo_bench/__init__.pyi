@@ -134,9 +134,9 @@ from .sensing.camera import Mount as Mount
 from .sensing.crops import Crop as Crop
 from .sensing.crops import drawn_crops as drawn_crops
 from .sensing.crops import real_crops as real_crops
+from .sensing.dem import read_dem as read_dem
 from .sensing.ground import Dem as Dem
 from .sensing.ground import Plane as Plane
-from .sensing.ground import read_dem as read_dem
 from .sensing.image import AerialImage as AerialImage
 from .sensing.image import LabelledImage as LabelledImage
 from .sensing.image import decode_image as decode_image

@@ -19,8 +19,9 @@ from sasgeo_bench.running import (
     testing,
     training,
 )
-from sasgeo_bench.running.segmenting import SegmenterProcess
-from sasgeo_bench.running.serve import PluginServer, Server
+from sasgeo_bench.running.segmenter_process import SegmenterProcess
+from sasgeo_bench.running.serve import Server
+from sasgeo_bench.running.server import PluginServer
 from sasgeo_bench.running.worker import PluginProcess, Worker
 
 

@@ -23,7 +23,7 @@ from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.locate import find_extract
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_layers, read_overview
-from sasgeo_bench.regions.preview import paint_overview
+from sasgeo_bench.regions.painting import paint_overview
 from sasgeo_bench.regions.proposing import STEP_M
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_spec import RegionFile, Scene, list_region_files, read_region_file

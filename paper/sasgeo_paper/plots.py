@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.canvas import GREY, Page, page, panels, without_ticks
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import HIDDEN, class_keys, paint_evidence
+from sasgeo_bench.regions.painting import HIDDEN, paint_evidence
+from sasgeo_bench.regions.preview import class_keys
 from sasgeo_bench.tasks.sheet import Panel
 
 # Okabe and Ito's colours, distinct for colour-blind readers; marks and dashes differ too.

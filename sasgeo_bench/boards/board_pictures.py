@@ -36,7 +36,7 @@ from sasgeo_bench.core.progress import spread, tell
 from sasgeo_bench.core.texts import json_text, one_line
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_overview
-from sasgeo_bench.regions.preview import paint_overview
+from sasgeo_bench.regions.painting import paint_overview
 from sasgeo_bench.regions.region import LICENCE, Manifest
 from sasgeo_bench.running.failures import Failures, is_disk_error
 from sasgeo_bench.running.prediction_files import StoredAnswers
@@ -203,7 +203,7 @@ def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], scored: Sc
 def _example(task: Task) -> bytes:
     shown = panels_of(task, choose=control_and_stress)
     title = f"{task.manifest.title}: {task.manifest.region}"
-    sheet = sheet_figure(title, shown, dpi=_SHEET_DPI, credit=task.manifest.provenance.credit)
+    sheet = sheet_figure(title, shown, dpi=_SHEET_DPI, credit=task.manifest.credit)
     return fitted(pixels_of(sheet), SUITE_BYTES)
 
 

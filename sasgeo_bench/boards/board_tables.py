@@ -54,7 +54,7 @@ from sasgeo_bench.scoring.decisions import PRESENT_SHARES
 from sasgeo_bench.scoring.metric import MeanMetric
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, LOCALIZATION, RISKS, WITHIN, primary_of
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, mixture_name
-from sasgeo_bench.scoring.requirements import FAILS, NOT_SHOWN, PASSES, is_latency, own_metrics
+from sasgeo_bench.scoring.requirements import FAILS, NOT_SHOWN, PASSES, is_latency, parse_requirements, stated_metrics
 from sasgeo_bench.scoring.rows import ALL_SUITES, base_name, is_unranked
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, MOST_STEPS, STRESS, is_bin, is_step
@@ -68,13 +68,13 @@ SHOWN_COSTS: Final = (  # and of the table of costs
 _SOUND: Final = ("ok", "not applicable")  # all else is a miss
 _PRIOR_ALONE: Final = "prior_centre"
 _ODOMETER_ALONE: Final = "dead_reckoning"
-_OF_FLIGHTS: Final = (
-    "right_accepted",
-    "false_accepted",
-    "error_p95",
-    "first_fix",
-    "longest_without_fix_m",
-)  # beside the first
+_OF_FLIGHTS: Final = {  # beside the first, with their titles
+    "right_accepted": "right_accepted",
+    "false_accepted": "false_accepted",
+    "error_p95": "error_p95 (m)",
+    "first_fix": "first_fix (m)",
+    "longest_without_fix_m": "longest_without_fix_m",
+}
 _USES: Final[Mapping[str, Mapping[str, str]]] = {  # what an integrator asks, by track, under the names of the field
     LOCALIZATION: {
         "within_10m": "R@10 m",
@@ -135,8 +135,12 @@ class Book:
         *,
         metrics: Sequence[MetricRecord] = (),
         within: Sequence[str] = (),
+        require: Sequence[str] = (),
     ) -> Self:
-        """Index a leaderboard with its entries, which may be listed, scored queries, metrics of others and limits."""
+        """Index a leaderboard with its entries, which may be listed, scored queries, metrics of others and limits.
+
+        `within` are limits and `require` requirements, as they were stated.
+        """
         entries = {entry.name: entry for entry in listed}
         for row in records_of(board.drop_duplicates("matcher")) if "set_apart" in board else ():
             reason: str | None = None if pd.isna(row["set_apart"]) else row["set_apart"]
@@ -165,7 +169,7 @@ class Book:
             counted={key: _counted(rows) for key, rows in _by_group(scored)},
             lost={key: ", ".join(_lost(rows)) for key, rows in _by_group(scored)},
             metrics={one.name: one for one in metrics},
-            own={one.metric.name: one.metric for one in own_metrics(within)},
+            own=stated_metrics(within, parse_requirements(require)),
         )
 
     def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
@@ -179,14 +183,18 @@ class Book:
     def besides(self, track: str) -> tuple[str, ...]:
         """Return the figures that a table shows beside the primary one, of the same queries."""
         own = _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
-        tracks = {name: one.tracks for name, one in self.own.items()}
-        tracks |= {name: tuple(one.tracks) for name, one in self.metrics.items()}
-        return (*own, *(name for name, asked in tracks.items() if track in asked))
+        others = (name for name, one in self.metrics.items() if track in one.tracks)
+        return tuple(dict.fromkeys((*own, *self.asked(track), *others)))
+
+    def asked(self, track: str) -> tuple[str, ...]:
+        """Return the shares that limits and requirements ask for, but for the primary one."""
+        return tuple(name for name, one in self.own.items() if track in one.tracks and name != primary_of(track).name)
 
     def column(self, term: str, *, order: str = "none") -> Column:
         """Return the column of a term, which may be a metric of another package."""
         metric, plain = self.metrics.get(term), column(term, order=order)
         if metric is None:
+            plain = replace(plain, name=_OF_FLIGHTS.get(term, plain.name))
             return replace(plain, meaning=self.own[term].meaning) if term in self.own else plain
         unit = "" if metric.unit == "1" else f" ({metric.unit})"
         return replace(plain, name=f"{term}{unit}", meaning=metric.to_text())
@@ -319,12 +327,17 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     def _figure(metric: str, stratum: str = "") -> Callable[[Record], Cell]:
         return lambda row: figure_cell(book.pick(key, row["matcher"], metric, stratum or row["stratum"]))
 
+    def _control(row: Record) -> Cell:
+        found = book.pick(key, row["matcher"], primary, CONTROL)
+        is_same = found is not None and row["stratum"] == ALL and found["n"] == row["n"]  # nothing is stressed
+        return figure_cell(None if is_same else found)
+
     fields: tuple[Field[Record], ...] = (
         (word("matcher"), lambda row: book.name_cell(row["matcher"])),
         (column(primary, order="descending"), lambda row: figure_cell(row, has_bar=True)),
         (column("rank"), lambda row: rank_cell(row, ranked=ranked, mark=shares if row["matcher"] in tie_of else None)),
         *((book.column(metric), _figure(metric)) for metric in beside),
-        (column("control"), _figure(primary, CONTROL)),
+        (column("control"), _control),
         (column("false fixes"), _figure(FALSE_ABSENT.name, ALL)),
         (column("detectable"), lambda row: float(row["detectable"])),
         (column("n"), lambda row: int(row["n"])),
@@ -539,13 +552,15 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
         (name for name, rows in found.items() if any(row is not None for row in rows)),
         key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
     )
+    limits = [(key, name) for key in shown for name in book.asked(track)]
     whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
     weighed = [at for at, key in enumerate(shown) if ranked[key]]  # the others have too few places
     has_mean = len(weighed) > 1 and len(whole - book.controls) > 1
-    rows = _overview_heads(book, shown, absent, primary, has_mean=has_mean)
+    rows = _overview_heads(book, shown, absent, primary, empty=len(limits) + has_mean)
     for name in order:
         cells = [short_cell(by_suite[key][name], is_rivalled=ranked[key] > 1) for key in shown]
         cells += [short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False) for key in absent]
+        cells += [short_cell(book.main(key, name, limit), has_rank=False) for key, limit in limits]
         if has_mean:
             cells.append(number_cell(_mean_value([found[name][at] for at in weighed]) if name in whole else math.nan))
         tone = "head" if name in book.controls else "plain"
@@ -553,6 +568,10 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
     columns = (
         *(_suite_column(book, key, primary, has_absent=key in absent) for key in shown),
         *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
+        *(
+            replace(book.column(limit), name=limit if len(shown) == 1 else f"{key[0]}: {limit}")
+            for key, limit in limits
+        ),
         *([column("mean")] if has_mean else []),
     )
     return Table(
@@ -602,19 +621,23 @@ def _mean_value(rows: Sequence[Record | None]) -> float:
     return sum(values) / len(values) if values else -1.0
 
 
-def _overview_heads(
-    book: Book, keys: Sequence[Key], absent: Sequence[Key], primary: str, *, has_mean: bool
-) -> list[Row]:
-    """Return lines above the matchers: how many queries count, and a ceiling below 1 and chance where there is one."""
-    lines = {"queries": [plain_cell(_count(book, key, primary)) for key in keys]}
-    beside = {"queries": [plain_cell(_count(book, key, FALSE_ABSENT.name)) for key in absent]}
+def _overview_heads(book: Book, keys: Sequence[Key], absent: Sequence[Key], primary: str, *, empty: int) -> list[Row]:
+    """Return lines above the matchers: how many queries count, and a ceiling below 1 and chance where there is one.
+
+    Their last `empty` columns say nothing.
+    """
+    what = "queries"
+    if keys and keys[0][1] == SEQUENCE:
+        what = "flights under stress" if any(STRESS in book.strata[key] for key in keys) else "flights"
+    lines = {what: [plain_cell(_count(book, key, primary)) for key in keys]}
+    beside = {what: [plain_cell(_count(book, key, FALSE_ABSENT.name)) for key in absent]}
     for title, metric in ((AT_MOST, CEILING.name), ("chance", CHANCE.name)):
         rows = [next(filter(None, (book.main(key, name, metric) for name in book.matchers[key])), None) for key in keys]
         lines[title] = [number_cell(_value_of(row)) for row in rows]
     nothing = [Cell(text="-")]
     return [
         Row(
-            cells=(Cell(text=title), *cells, *beside.get(title, nothing * len(absent)), *nothing * has_mean),
+            cells=(Cell(text=title), *cells, *beside.get(title, nothing * len(absent)), *nothing * empty),
             tone="head",
         )
         for title, cells in lines.items()

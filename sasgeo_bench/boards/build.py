@@ -91,6 +91,7 @@ def board_texts(scored: Scored) -> AdditionalFiles:
         entries=board.about.entries,
         metrics=board.about.metrics,
         within=board.about.within,
+        require=board.about.require,
         requirements=board.requirements,
         findings=board.findings,
         falsifiers=scored.falsifiers,

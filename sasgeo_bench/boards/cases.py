@@ -56,14 +56,15 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.regions.evidence import CERTAIN, UNKNOWN, Evidence, LayerBits, footprint, observe
 from sasgeo_bench.regions.layers import PRESENT
-from sasgeo_bench.regions.preview import GROUND, HIDDEN, class_keys, paint_evidence, paint_overview, pooled, scale_bar
+from sasgeo_bench.regions.painting import GROUND, HIDDEN, paint_evidence, paint_overview, pooled
+from sasgeo_bench.regions.preview import class_keys, scale_bar
 from sasgeo_bench.regions.region import Manifest, Region
 from sasgeo_bench.scoring.base import Bools
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.rejection import OWN
 from sasgeo_bench.scoring.score import FIX_M
-from sasgeo_bench.tasks.query import Query, Truth, base_of
+from sasgeo_bench.tasks.query import SEQUENCE, TRUTH_SIGMA, Query, Truth, base_of
 from sasgeo_bench.tasks.segmented import Segmented
 
 BOTH: Final = "also without the stress"
@@ -196,13 +197,43 @@ def count_cases(cases: pd.DataFrame) -> dict[str, int]:
     return {name: int(counts.get(name, 0)) for name in FAILURES}
 
 
-def count_turned(scores: pd.DataFrame) -> int:
-    """Return the number of right fixes whose heading is off by more than success allows; no failure holds them.
+def is_turned(scores: pd.DataFrame) -> Bools:
+    """Return which fixes are right with a heading that is off by more than success allows; no failure holds them.
 
-    >>> count_turned(pd.DataFrame({"is_right": [True, True, False], "yaw_error_deg": [4.0, 6.0, 90.0]}))
-    1
+    >>> is_turned(pd.DataFrame({"is_right": [True, True, False], "yaw_error_deg": [4.0, 6.0, 90.0]})).tolist()
+    [False, True, False]
     """
-    return int((scores["is_right"].astype(bool) & (scores["yaw_error_deg"] > SUCCESS_DEG)).sum())
+    return np.asarray(scores["is_right"].astype(bool) & (scores["yaw_error_deg"] > SUCCESS_DEG), dtype=bool)
+
+
+def turned_line(scores: pd.DataFrame) -> str:
+    """Return how many fixes of one matcher are right with another heading, and which figures count them; "" if none."""
+    turned = scores[is_turned(scores)]
+    if not len(turned):
+        return ""
+    stated = " the one that its file states" if is_own(turned).all() else ""
+    return (
+        f"{counted(len(turned), 'more query is', 'more queries are')} within {FIX_M:g} m of the place with a heading "
+        f"more than {SUCCESS_DEG:g} degrees off{stated}: within_25m counts them, success_25m does not"
+    )
+
+
+def own_lines(scores: pd.DataFrame) -> list[str]:
+    """Return `turned_line` of each matcher on single views of a user's own pictures.
+
+    >>> rows = {"matcher": ["a", "b"], "is_right": True, "yaw_error_deg": [6.0, 4.0]}
+    >>> own_lines(pd.DataFrame(rows | {"strength_unit": TRUTH_SIGMA, "track": "localization"}))
+    ['a: 1 more query is within 25 m of the place with a heading more than 5 degrees off the one that its file states: \
+within_25m counts them, success_25m does not']
+    """
+    own = scores[is_own(scores) & (scores["track"] != SEQUENCE)] if len(scores) else scores
+    lines = {str(name): turned_line(rows) for name, rows in own.groupby("matcher", sort=True)} if len(own) else {}
+    return [f"{name}: {line}" for name, line in lines.items() if line]
+
+
+def is_own(scores: pd.DataFrame) -> Bools:
+    """Return which scored rows are of a user's own pictures, whose true poses are as good as a file says."""
+    return scores["strength_unit"].eq(TRUTH_SIGMA).to_numpy(bool)
 
 
 class Words(TypedDict):
@@ -348,6 +379,8 @@ class CasePicture:
         The newest picture that the evidence was made of, RGB.
     segmented : Segmented, optional
         What a segmenter says of that picture.
+    is_own : bool
+        Whether it is a user's own picture, whose true heading is the one that its file states.
     """
 
     title: str
@@ -365,6 +398,7 @@ class CasePicture:
     region: str = ""
     picture: NDArray[np.uint8] | None = None
     segmented: Segmented | None = None
+    is_own: bool = False
 
     @property
     def error_m(self) -> float | None:
@@ -388,6 +422,11 @@ class CasePicture:
         if error_m is None or error_deg is None or not self.is_present:
             return False
         return error_m <= FIX_M and error_deg <= SUCCESS_DEG
+
+    @property
+    def is_turned(self) -> bool:
+        """Return whether the place is right, as `within_25m` counts it, and the heading is not."""
+        return self.is_present and self.error_m is not None and self.error_m <= FIX_M and not self.is_found
 
 
 def disc_of(query: Query) -> tuple[float, float, float] | None:

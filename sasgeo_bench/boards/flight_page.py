@@ -17,12 +17,12 @@ from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.preview import paint_evidence
+from sasgeo_bench.regions.painting import paint_evidence
 from sasgeo_bench.scoring.flights import SHARE_INSIDE
 from sasgeo_bench.scoring.relative_pose import relative_errors
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.tasks.sheet import Ground, bounds_of_m, flight_panels
+from sasgeo_bench.tasks.sheet import Ground, bounds_of_m, flight_panels, flight_title
 from sasgeo_bench.tasks.task_files import Task
 
 Pixels = NDArray[np.uint8]
@@ -80,10 +80,10 @@ def flight_page(task: Task, flight: str, tracker: str, views: pd.DataFrame, answ
             title=f"{tracker} on {task.manifest.suite} over {task.manifest.region}",
             tracker=tracker,
             flight=flight,
-            kind=f"{panel.truth.role}: {panel.truth.kind}",
+            kind=flight_title(panel.truth),
             what=task.manifest.what,
             left_out=step > 1 and f"One of {step} of the {len(mine)} views is shown.",
-            credit=task.manifest.provenance.credit,
+            credit=task.manifest.credit,
             facts=_facts(mine),
             keys=[(item.title, item.colour) for item in load_taxonomy().classes if item.name in manifest.classes],
             map_uri=_uri(np.asarray(painted, dtype=np.uint8), 80),

@@ -36,12 +36,13 @@ from sasgeo_bench.core.errors import ConfigError, StoreError, check_given, count
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.preview import HIDDEN, scale_bar
+from sasgeo_bench.regions.painting import HIDDEN
+from sasgeo_bench.regions.preview import scale_bar
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.scoring.flights import DRIFT_M, RECKONED_M
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import CONTROL, DRIFT, GROUP, primary_rows
-from sasgeo_bench.tasks.sheet import TRUE, Ground, bounds_of_m, draw_flight, flight_keys, flight_panels
+from sasgeo_bench.tasks.sheet import TRUE, Ground, bounds_of_m, draw_flight, flight_keys, flight_panels, flight_title
 from sasgeo_bench.tasks.task_files import Task
 
 MOST_TRACKERS: Final = 6
@@ -166,7 +167,7 @@ def flight_map_pixels(task: Task, flight: str, views: Mapping[str, pd.DataFrame]
     across = min(_ACROSS, len(names))
     sheet = Page(
         title=f"{about.title}: {about.region}",
-        facts=f"One flight, {truth.role}: {truth.kind}. {about.what}",
+        facts=f"One flight, {flight_title(truth)}. {about.what}",
         note="North is up." + (" Trackers differ most on this flight of the suite." if len(names) > 1 else ""),
         data=about.provenance.credit,
         rows=-(-len(names) // across),

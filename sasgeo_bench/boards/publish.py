@@ -3,7 +3,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -45,6 +45,8 @@ from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.core.folders import SITE, absolute, resolve_link, scratch_folder
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
+from sasgeo_bench.regions.region import MADE_UP
+from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.intervals import DRAWS
@@ -84,7 +86,7 @@ def publish(board: Path, into: Path | None = None, *, root: Path = Path("out"), 
         with _sound(board):
             scenes = _scenes(files.board)
             files = replace(files, downloads=(*files.downloads, *_scenes_file(scenes)))
-            source = replace(_source(files), scenes=scenes)
+            source = replace(_source(files, root), scenes=scenes)
             pages = site_pages(source)
         with site_lock(board, target):
             written = write_site(
@@ -132,14 +134,14 @@ def _sound(board: Path) -> Iterator[None]:
         raise StoreError(f"{board} holds a board that no page can be made of ({text}): score it again") from error
 
 
-def _source(files: BoardFiles) -> SiteSource:
-    """Return the content of all pages, with figures of places and rates drawn for them."""
+def _source(files: BoardFiles, root: Path) -> SiteSource:
+    """Return the content of all pages, with figures of places and rates drawn for them; `root` holds built regions."""
     about, name = files.board.about, _name_of(files.board)
     spec = _pipeline_of(about.pipeline)
-    spots, parts = _spots(), _parts(about.split)
+    spots, parts = _spots(regions_of(about.tasks), root), _parts(about.split)
     lost = [region for region in regions_of(about.tasks) if region not in spots]
     if lost:
-        tell(f"not on the map of places, for no region of that name ships: {', '.join(lost)}")
+        tell(f"not on the map of places, for no region of that name ships or is built in {root}: {', '.join(lost)}")
     places = places_on_map(about.tasks, spots, parts)
     book = load_ratebook()
     drawing: dict[str, Callable[[Path], None]] = {_RATES: partial(draw_rates, book=book)}
@@ -211,8 +213,8 @@ def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast,
     return () if spec is None else tuple(item.registered for item in spec.contrast)
 
 
-def _spots() -> dict[str, Spot]:
-    """Return the places of the shipped regions."""
+def _spots(regions: Iterable[str], root: Path) -> dict[str, Spot]:
+    """Return the places of the shipped regions, and of others in `regions` that are built below `root`."""
     found = {}
     for name, path in list_region_files().items():
         spec = read_region_file(path)
@@ -224,6 +226,22 @@ def _spots() -> dict[str, Spot]:
             latitude_deg=(south + north) / 2,
             scenes=tuple(spec.scenes),
             is_made_up=any(item.town is not None for item in spec.extract),
+        )
+    for name in regions:
+        folder = root / "regions" / Path(name).name
+        if name in found or name.startswith(MADE_UP):
+            continue
+        try:
+            manifest = read_manifest(folder)
+        except StoreError:  # not built here, or damaged: the board does not need it
+            continue
+        west, south, east, north = manifest.bounds_lonlat
+        found[name] = Spot(
+            region=name,
+            title=manifest.title,
+            longitude_deg=(west + east) / 2,
+            latitude_deg=(south + north) / 2,
+            scenes=tuple(manifest.scenes),
         )
     return found
 

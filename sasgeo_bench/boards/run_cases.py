@@ -152,6 +152,7 @@ def read_picture(case: Case, task: Task) -> CasePicture:
         region=query.region,
         picture=query.frames[-1].image().rgb if query.frames else None,
         segmented=read_segmented(segmented_file(task.root, task.manifest.queries_sha256), query.query_id),
+        is_own=truth.is_own,
     )
 
 

@@ -102,6 +102,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         scenes=source.scenes,
         metrics=board.about.metrics,
         within=board.about.within,
+        require=board.about.require,
         requirements=board.requirements,
     )
     site = Site(

@@ -72,7 +72,7 @@ class SiteFigure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spot:
-    """Place of a region, from its shipped file."""
+    """Place of a region, from its shipped file, or as it was built."""
 
     region: str
     title: str

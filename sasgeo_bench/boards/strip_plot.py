@@ -20,14 +20,17 @@ from sasgeo_bench.boards.cases import (
     draw_panel,
     draw_picture,
     evidence_keys,
+    is_own,
+    is_turned,
     pixels_of,
 )
 from sasgeo_bench.boards.run_cases import RunCases, picture_of
 from sasgeo_bench.core.canvas import GREY, Page, new_figure, styled, without_ticks
 from sasgeo_bench.core.errors import ConfigError, counted
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.rows import is_unranked
+from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.query import BY, PERCEIVED
 
 _SIDE_INCHES: Final = 2.3
@@ -35,18 +38,22 @@ _DPI: Final = 100
 _COLUMNS: Final = ("picture", "segmentation", "evidence, heading up", "map at the pose found", "map, north up")
 _FOUND: Final = "#00695c"
 _MISSED: Final = "#b3261e"
+_TURNED: Final = "#8a5a00"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Strip:
     """Queries of one matcher on pictures: how often it finds the pose in all of them, and some to look at.
 
-    `query_ids` are half failures, as far as there are, and these last.
+    `query_ids` are half failures, as far as there are, and these last. `turned` of a user's own pictures are at the
+    right place with another heading than their files state, and `has_stress` if any query is under stress.
     """
 
     found: int
     total: int
     query_ids: tuple[str, ...]
+    turned: int = 0
+    has_stress: bool = False
 
     @classmethod
     def of(cls, scores: pd.DataFrame, pictured: Collection[tuple[str, str]], count: int) -> Self:
@@ -56,7 +63,7 @@ class Strip:
         ----------
         scores : DataFrame
             One matcher's rows: `query_id`, `suite`, `region`, `role`, `detector`, `is_present`, `is_right`,
-            `yaw_error_deg`.
+            `yaw_error_deg`, `strength_unit`.
         pictured : collection of (suite, region)
             Tasks that hold pictures. Queries of others count nowhere, nor do those of a model of perception, falsifiers
             and places that are not on the map.
@@ -67,9 +74,9 @@ class Strip:
         --------
         >>> rows = {"query_id": list("abcd"), "suite": "aerial", "region": ["x", "x", "y", "y"], "role": "control"}
         >>> answers = {"is_right": [False, False, False, True], "yaw_error_deg": 1.0}
-        >>> scores = pd.DataFrame({**rows, **answers, "is_present": True, "detector": "rendered"})
+        >>> scores = pd.DataFrame({**rows, **answers, "is_present": True, "detector": "rendered", "strength_unit": "m"})
         >>> Strip.of(scores, {("aerial", "x"), ("aerial", "y")}, 3)
-        Strip(found=1, total=4, query_ids=('d', 'a', 'c'))
+        Strip(found=1, total=4, query_ids=('d', 'a', 'c'), turned=0, has_stress=False)
         """
         keys = pd.MultiIndex.from_frame(scores[["suite", "region"]])
         is_usable = scores["is_present"].astype(bool) & (scores["role"] != "falsifier") & keys.isin(list(pictured))
@@ -81,15 +88,19 @@ class Strip:
         failed, right = (own.loc[own["is_found"] == is_found, "query_id"].tolist() for is_found in (False, True))
         wrong = min(max(count // 2, count - len(right)), len(failed))
         chosen = (*right[: count - wrong], *failed[:wrong])
-        return cls(found=len(right), total=len(own), query_ids=chosen)
+        turned = int((is_turned(own) & is_own(own)).sum())
+        has_stress = bool((own["role"] == STRESS).any())
+        return cls(found=len(right), total=len(own), query_ids=chosen, turned=turned, has_stress=has_stress)
 
     @property
     def facts(self) -> str:
         """Return how often the pose is found, and how the queries were chosen."""
+        more = f" (in {self.turned} more the place, with another heading than the file states)" if self.turned else ""
+        stress = " Views without the stress (control) are among them; tables count those under stress."
         return (
-            f"The pose is found (within 25 m and 5 deg) in {self.found} of {counted(self.total, 'query', 'queries')}; "
-            f"here are {len(self.query_ids)} of them, half of them failures where there are so many. Views without the "
-            "stress (control) are among them; tables count those under stress."
+            f"The pose is found (within 25 m and 5 deg) in {self.found} of {counted(self.total, 'query', 'queries')}"
+            f"{more}; here are {len(self.query_ids)} of them, half of them failures where there are so many."
+            f"{stress if self.has_stress else ''}"
         )
 
 
@@ -97,7 +108,7 @@ def best_on_pictures(scores: Mapping[str, pd.DataFrame], pictured: Collection[tu
     """Return the matcher, controls apart, that finds most queries with pictures; None if none was asked any.
 
     >>> rows = {"query_id": ["q"], "suite": "aerial", "region": "x", "role": "control", "detector": "rendered"}
-    >>> rows |= {"is_present": True, "yaw_error_deg": 0.0}
+    >>> rows |= {"is_present": True, "yaw_error_deg": 0.0, "strength_unit": "m"}
     >>> good, bad = (pd.DataFrame(rows | {"is_right": found}) for found in (True, False))
     >>> best_on_pictures({"a": bad, "b": good, "oracle_pose": good}, {("aerial", "x")})
     'b'
@@ -164,15 +175,6 @@ def _keys(rows: Sequence[CasePicture]) -> list[Artist]:
     return [*keys, *evidence_keys(shown)]
 
 
-def _known(view: Evidence) -> Evidence:
-    """Return the evidence of the classes of which anything is known: those the segmenter never learned say nothing."""
-    kept = (view.cells != UNKNOWN).any(axis=(1, 2))
-    if not kept.any():
-        return view
-    classes = tuple(name for name, is_known in zip(view.classes, kept, strict=True) if is_known)
-    return Evidence(classes=classes, cells=view.cells[kept], cell_size_m=view.cell_size_m)
-
-
 def _draw_row(line: Sequence[Axes], case: CasePicture, *, is_first: bool) -> None:
     """Draw a query; the first row names the columns."""
     if case.picture is not None:
@@ -184,7 +186,7 @@ def _draw_row(line: Sequence[Axes], case: CasePicture, *, is_first: bool) -> Non
         line[1].text(
             0.5, 0.5, "not stored: segment again", ha="center", va="center", color=GREY, transform=line[1].transAxes
         )
-    draw_panel(line[2], "", _known(case.view))
+    draw_panel(line[2], "", case.view.of_known_classes())
     draw_panel(line[3], "", case.at_answer)
     draw_map(line[4], case)
     across_m = max(case.part.east_m - case.part.west_m, case.part.north_m - case.part.south_m)
@@ -193,7 +195,8 @@ def _draw_row(line: Sequence[Axes], case: CasePicture, *, is_first: bool) -> Non
     line[4].set_xlabel(f"{across_m:.0f} m across", fontsize=8, labelpad=2)
     what = case.what.split(" (")[0].replace(", strength", "")  # without the unit, which has no room
     line[0].set_xlabel(f"{case.region}: {what}", fontsize=8, labelpad=2, loc="left")
-    verdict = "FOUND" if case.is_found else "MISSED"
     off = "no answer" if case.error_m is None else f"{case.error_m:.0f} m and {case.error_deg:.0f} deg off"
-    colour = _FOUND if case.is_found else _MISSED
-    line[3].set_xlabel(f"{verdict}: {off}", fontsize=9.5, weight="bold", color=colour, labelpad=2)
+    verdict, colour = (f"FOUND: {off}", _FOUND) if case.is_found else (f"MISSED: {off}", _MISSED)
+    if case.is_own and case.is_turned:  # the heading is a compass's, and may itself be wrong
+        verdict, colour = f"PLACE FOUND: {off}", _TURNED
+    line[3].set_xlabel(verdict, fontsize=9, weight="bold", color=colour, labelpad=2)

@@ -244,7 +244,8 @@ class Contents:
 
     `scores` are the scored queries, `steps` the steps of stress (`strata.steps_frame`), `ages` their names where they
     are ages of a map (`plots.age_names`), `scenes` success by kind of place (`tables.scene_frame`), `metrics`
-    those of other packages, `within` the limits that were stated, and `requirements` what came of requirements.
+    those of other packages, `within` and `require` the limits and requirements that were stated, and `requirements`
+    what came of the latter.
     """
 
     leaderboard: pd.DataFrame
@@ -260,12 +261,14 @@ class Contents:
     scenes: pd.DataFrame = field(default_factory=pd.DataFrame)
     metrics: Sequence[MetricRecord] = ()
     within: Sequence[str] = ()
+    require: Sequence[str] = ()
     requirements: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     @cached_property
     def book(self) -> Book:
         """Return the figures that take every answer, by entry and queries."""
-        return Book.of(self.leaderboard, self.entries, self.scores, metrics=self.metrics, within=self.within)
+        stated = {"within": self.within, "require": self.require}
+        return Book.of(self.leaderboard, self.entries, self.scores, metrics=self.metrics, **stated)
 
 
 class TableKind(NamedTuple):

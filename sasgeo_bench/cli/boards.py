@@ -11,6 +11,7 @@ import typer
 from sasgeo_bench.boards.archive import board_of, request_of, score_all
 from sasgeo_bench.boards.archive_file import is_pack
 from sasgeo_bench.boards.board import Board
+from sasgeo_bench.boards.cases import own_lines
 from sasgeo_bench.boards.manifests import SeedRecord
 from sasgeo_bench.boards.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.boards.private_board import check_public, read_private
@@ -330,7 +331,13 @@ def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) 
 
 def show_board(board: Board) -> None:
     """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
-    shown = Contents(leaderboard=board.leaderboard, findings=board.findings, requirements=board.requirements)
+    shown = Contents(
+        leaderboard=board.leaderboard,
+        within=board.about.within,
+        require=board.about.require,
+        findings=board.findings,
+        requirements=board.requirements,
+    )
     kinds = tables_of(shown, TERMINAL)
     for table in (one for tables in kinds.values() for one in tables if one.rows):
         say(table.title)
@@ -339,5 +346,6 @@ def show_board(board: Board) -> None:
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
-    for line in (*map_lines(board.about), *warnings_of(board.leaderboard), *metric_lines(board.about)):
+    turned = own_lines(board.scores)
+    for line in (*turned, *map_lines(board.about), *warnings_of(board.leaderboard), *metric_lines(board.about)):
         tell(line)

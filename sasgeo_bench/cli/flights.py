@@ -244,7 +244,7 @@ def check_gnss_command(options: GnssOptions) -> None:
     if not cases.flights:
         raise FlightError(f"{options.run} has no flights: name a run of a tracker on a task of flights")
     table = Table(
-        *("suite", "region", "flights", "hours", "fixes", "false alarms / h", "at most (95 %)"),
+        *("suite", "region", "flights", "paths", "hours", "fixes", "false alarms / h", "at most (95 %)"),
         *("pull-off, m/s", "noticed", "after s: p50", "p95"),
         box=None,
         pad_edge=False,
@@ -252,7 +252,8 @@ def check_gnss_command(options: GnssOptions) -> None:
     for (suite, region), found in cases.flights.items():
         task = Task.open(cases.root / "tasks" / suite / region, cases.root)
         is_own = task.manifest.strength_unit == TRUTH_SIGMA
-        groups = [views for _, views in found.views.groupby("sequence_id", sort=True)]
+        groups = dict(tuple(found.views.groupby("sequence_id", sort=True)))
+        sites = found.flights.set_index("query_id")["pair_id"]
         for speed_mps in speeds_mps:
             checks = [
                 check_gnss(
@@ -263,20 +264,21 @@ def check_gnss_command(options: GnssOptions) -> None:
                     draws_noise=not is_own,
                     seed=options.seed + number,
                 )
-                for number, views in enumerate(groups)
+                for number, views in enumerate(groups.values())
             ]
-            figures = summary(checks)
+            figures = summary(checks, [str(sites[name]) for name in groups])
             fixes = sum(one.fixes for one in checks)
             times_s = (figures["notice_p50_s"], figures["notice_p95_s"])
             table.add_row(
-                *(suite, region, str(len(groups)), f"{figures['hours']:.2g}", str(fixes)),
+                *(suite, region, str(len(groups)), str(figures["paths"]), f"{figures['hours']:.2g}", str(fixes)),
                 *(f"{figures['alarms_per_hour']:.2f}", f"{figures['alarms_per_hour_at_most']:.2f}", f"{speed_mps:g}"),
                 f"{figures['noticed']:.0%}",
                 *("never" if time == math.inf else f"{time:.0f}" for time in times_s),
             )
         whose = "the truths are the receiver's own places" if is_own else f"the receiver is off by {options.sigma:g} m"
         alarm = f"an alarm is {options.in_a_row} accepted fixes in a row outside of the ellipse of {SHARE:.1%}"
-        tell(f"{suite} on {region}: {whose}; {alarm}")
+        once = "; flights along one path count as one in hours and bound" if len(groups) > len(set(sites)) else ""
+        tell(f"{suite} on {region}: {whose}; {alarm}{once}")
     print_table(table)
 
 

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.boards.board_files import BOARD, read_board_manifest, read_scores
-from sasgeo_bench.boards.cases import case_pixels, count_cases, count_turned, sample_cases, write_png
+from sasgeo_bench.boards.cases import case_pixels, count_cases, sample_cases, turned_line, write_png
 from sasgeo_bench.boards.flight_page import flight_page
 from sasgeo_bench.boards.flight_plots import flight_map_pixels
 from sasgeo_bench.boards.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
@@ -30,9 +30,7 @@ from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.rows import base_name
-from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.query import BY, SEQUENCE_DIGITS
 from sasgeo_bench.tasks.sheet import flight_panels, panels_of, write_flight_sheet, write_sheet
@@ -212,12 +210,8 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | Non
     only = f", {stressed} of the queries under stress: boards count these first, and controls apart" if stressed else ""
     say(f"{cases.entry.name}: {counted(len(found), 'failure')} in {counted(total, 'query', 'queries')}{only}")
     print_table(table)
-    turned = count_turned(cases.scores)
-    if turned:
-        say(
-            f"{counted(turned, 'more query is', 'more queries are')} within {FIX_M:g} m of the place with a heading "
-            f"more than {SUCCESS_DEG:g} degrees off: within_25m counts them, success_25m does not"
-        )
+    if turned := turned_line(cases.scores):
+        say(turned)
 
 
 def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Final
 
+import pyarrow as pa
 import typer
 
 from sasgeo_bench.cli.built_regions import built_region
@@ -20,8 +21,9 @@ from sasgeo_bench.core.texts import plain
 from sasgeo_bench.observing.fixes import MATCHER, MOST_FALSE, RADIUS_M, SEGMENTER, Fix, Located, LocateRequest
 from sasgeo_bench.observing.locate import locate as located_by
 from sasgeo_bench.observing.pictures import Told
-from sasgeo_bench.observing.results import PAGE, Strips, write_results
+from sasgeo_bench.observing.results import PAGE, TABLE, Strips, write_results
 from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
+from sasgeo_bench.running.memory import be_lean
 from sasgeo_bench.sensing.video import EVERY_S, is_video
 
 _HEADING: Final = re.compile(r"([+-]?[0-9]+(?:\.[0-9]+)?)(?:\+-([0-9]+(?:\.[0-9]+)?))?")
@@ -90,6 +92,10 @@ class SearchOptions(Options):
     ] = None
     height: Annotated[float | None, typer.Option(help="of the camera above the ground, metres")] = None
     ground_width: Annotated[float | None, typer.Option(help="width of the ground in each picture, metres")] = None
+    dem: Annotated[
+        Path | None,
+        typer.Option(help="GeoTIFF of the ground's heights, for photos with an altitude and no height above take-off"),
+    ] = None
     matcher: Annotated[str, typer.Option(help="name from list matchers, or module:Class")] = MATCHER
     segmenter: Annotated[str, typer.Option(help="name from list segmenters, with weights, or module:Class")] = SEGMENTER
     exif_position: Annotated[
@@ -111,8 +117,8 @@ def locate(options: LocateOptions) -> Located:
     """Find out where pictures were taken, and how far to trust it; a page shows what was seen and where it fits.
 
     The position in a file is the middle of nothing: it lies anywhere in the disc that is searched, so that it can be
-    no answer. A second call goes on where the first was cut off. A video is located by frames of it, which get places,
-    heights and angles of its track.
+    no answer. A second call goes on where the first was cut off; if every picture fails, results of an earlier call
+    stay. A video is located by frames of it, which get places, heights and angles of its track.
 
     Returns
     -------
@@ -144,6 +150,8 @@ def locate(options: LocateOptions) -> Located:
         weights = unpack_map(options.region, options.out).about.weights
         if weights is not None:
             tell(f"what {weights.matcher} has learned is left packed: P(false fix) is calibrated without it")
+    if options.dem is not None and not options.dem.is_file():
+        raise ConfigError(f"there is no file of heights {options.dem}: check the path")
     into = options.into or options.out / "locate" / _name_of(options.pictures)
     heading = None if options.heading in (None, "any") else _heading(options.heading or "")
     request = LocateRequest(
@@ -155,7 +163,7 @@ def locate(options: LocateOptions) -> Located:
         radius_m=options.radius,
         heading=heading,
         is_turned=options.heading == "any",
-        told=Told(height_m=options.height, ground_width_m=options.ground_width),
+        told=Told(height_m=options.height, ground_width_m=options.ground_width, dem=options.dem),
         matcher=options.matcher,
         segmenter=options.segmenter,
         uses_position=options.exif_position,
@@ -174,7 +182,10 @@ def locate(options: LocateOptions) -> Located:
     answered = [found.calibration] if any(fix.p_false is not None for fix in found.fixes) else []
     for note in (*answered, *notes_of(found.fixes)):
         tell(note)
-    write_results(found)
+    if all(fix.status == "failed" for fix in found.fixes) and (into / TABLE).is_file():
+        tell(f"no picture could be asked: {into} keeps the results of an earlier call")
+    else:
+        write_results(found)
     return found
 
 
@@ -208,6 +219,8 @@ def notes_of(fixes: Sequence[Fix]) -> list[str]:
 
 def locate_command(options: LocateOptions) -> None:
     """Find out where pictures of your own were taken, and how far to trust it: a line for each, tables and a page."""
+    be_lean()
+    pa.set_memory_pool(pa.system_memory_pool())  # Arrow's own keeps what was freed
     with said_after() as say_later:
         found = locate(**vars(options) | {"say": say_later})
     counts = Counter(fix.status for fix in found.fixes)
@@ -215,7 +228,7 @@ def locate_command(options: LocateOptions) -> None:
     say(found.request.into / PAGE)
     failed = sum(fix.status == "failed" for fix in found.fixes)
     if failed:
-        complain(f"{failed} of {len(found.fixes)} pictures could not be asked; their rows say why")
+        complain(f"{failed} of {len(found.fixes)} pictures could not be asked; their lines say why")
         raise typer.Exit(CONTESTANT_FAILED)
 
 

@@ -3,6 +3,7 @@
 
 import ast
 import inspect
+import re
 import sys
 import traceback
 import warnings
@@ -265,6 +266,7 @@ _UsageError: Any = typer.BadParameter.__base__
 def _tell_usage(error: Any) -> None:  # noqa: ANN401 - see _UsageError
     """Print a wrong word on the command line as one line."""
     text = error.format_message().strip().removesuffix(".")
+    text = re.sub(r"(Input should be|'[^']*' is not) a valid (number|float).*", "give the number alone, no unit", text)
     command = error.ctx.command_path if error.ctx is not None else "sasgeo-bench"
     complain(f"sasgeo-bench: {one_line(f'{text[:1].lower()}{text[1:]}')} (see '{command} --help')")
 

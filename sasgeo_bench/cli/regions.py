@@ -254,8 +254,8 @@ def _place(options: NewRegionOptions) -> "Place":
     if options.bounds is not None:
         return Place.within(options.bounds)
     if options.flight is not None:
-        return Place.of_points(_flown_over(options.flight, options.vehicle), noun="point")
-    return Place.of_points(_taken_at(options.photos or Path()))
+        return replace(Place.of_points(_flown_over(options.flight, options.vehicle), noun="point"), source="log")
+    return replace(Place.of_points(_taken_at(options.photos or Path())), source="photos")
 
 
 def _flown_over(log: Path, vehicle: int | None) -> NDArray[np.float64]:
@@ -271,8 +271,14 @@ def _taken_at(folder: Path) -> NDArray[np.float64]:
     from sasgeo_bench.sensing.photos import read_photo  # noqa: PLC0415 - as above
 
     if not folder.is_dir():
-        what = "is a file: unpack it, and name the folder" if folder.exists() else "is not there: check the path"
-        raise ConfigError(f"{folder} {what} of the photos")
+        if not folder.exists():
+            raise ConfigError(f"{folder} is not there: check the path of the photos")
+        from sasgeo_bench.observing.pictures import ARCHIVES  # noqa: PLC0415 - as above
+
+        kind = folder.suffix.lower()
+        mend = f"name the folder of the photos, as {folder.parent}" if kind in PHOTOS else "say --flight for a log"
+        mend = "unpack it, and name the folder of the photos" if kind in ARCHIVES else mend
+        raise ConfigError(f"{folder} is a file: {mend}")
     paths = sorted(path for path in folder.iterdir() if path.name.lower().endswith(PHOTOS))
     if not paths:
         raise ConfigError(f"{folder} holds no photo ({', '.join(PHOTOS)}): name the folder that they lie in")

@@ -127,7 +127,7 @@ def run(options: RunOptions) -> RunReport:
         return RunReport(counts={}, messages={}, folders=tuple(part.folder for part in plan.parts))
     report = runner.run(plan)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
-    tell(f"{plan.card.name} {plan.card.version}: {counts}")
+    tell(f"{plan.card.name}, version {plan.card.version}: {counts}")
     for status, message in sorted(report.messages.items()):
         tell(f"  {status}, one of {report.counts[status]}: {message}")
     for folder in report.folders:

@@ -2,6 +2,7 @@
 """Targets of `inspect` and `verify`: find what a name or folder means, or say what there is instead."""
 
 import difflib
+import tomllib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Final
@@ -10,6 +11,7 @@ from sasgeo_bench.boards.board_files import BOARD
 from sasgeo_bench.boards.run_cases import is_run
 from sasgeo_bench.cli.built_regions import MOST_NAMED
 from sasgeo_bench.core.errors import ConfigError, named
+from sasgeo_bench.observing.results import PAGE, TABLE
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.regions.region_spec import list_region_files
 from sasgeo_bench.running.prediction_files import RUN
@@ -21,6 +23,7 @@ from sasgeo_bench.tasks.task_files import TASK
 
 _ELSEWHERE: Final = {  # what else a folder may be, by a file in it, and the command for it
     BOARD: "a board: publish --board {0} makes a site of it",
+    TABLE: "what locate found: open {0}/index.html in a browser, or read {0}/locate.csv",
     SUBMISSION: "a submission: verify {0} --for BOARD checks it",
 }
 
@@ -31,8 +34,16 @@ def find_task(target: str, out: Path) -> Path | None:
 
 
 def is_split(target: str) -> bool:
-    """Return True for the id of a shipped split, and for any .toml file."""
-    return target.endswith(".toml") or target in list_split_files()
+    """Return True for the id of a shipped split, and for any .toml file but that of a region."""
+    return (target.endswith(".toml") and not _is_region_file(Path(target))) or target in list_split_files()
+
+
+def _is_region_file(path: Path) -> bool:
+    """Return whether a file has what every region file has, and no split."""
+    try:
+        return path.suffix == ".toml" and "extract" in tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
 
 
 def no_target(target: str, out: Path, folders: Collection[Path]) -> ConfigError:
@@ -43,6 +54,12 @@ def no_target(target: str, out: Path, folders: Collection[Path]) -> ConfigError:
     path = Path(target)
     if path.is_dir():
         message = _of_folder(path, out)
+    elif _is_region_file(path):
+        is_built = (out / "regions" / path.stem / MANIFEST).is_file()
+        whole = f"inspect {path.stem} shows it" if is_built else f"build-region {path} first, then inspect {path.stem}"
+        message = f"{path} is a region file: {whole}"
+    elif path.name == PAGE:
+        message = f"{path} is a page: open it in a browser"
     elif path.exists():
         whole = f"name its folder {path.parent}" if path.name in {MANIFEST, TASK, RUN} else _there(out)
         message = f"{target} is a file, not a region, task or run: {whole}"

@@ -340,7 +340,7 @@ def _copy_truths(folder: Path, task: ReleaseTask) -> None:
         _write_json(
             target / task_files.TRUTH_OF,
             {"queries_sha256": task.source.manifest.queries_sha256},
-            credit=task.source.manifest.provenance.credit,
+            credit=task.source.manifest.credit,
         )
 
 

@@ -100,8 +100,12 @@ def read_messages(path: Path, names: Sequence[str], fields: Collection[str] | No
     source.check_size(MOST_LOG_BYTES)
     with library(source, (Exception,)), _silent():  # which it raises as such
         with plain_file(path).open("rb") as file:
-            is_binary = file.read(2) == bytes((0xA3, 0x95))
-        if not is_binary:
+            head = file.read(64)
+        if head.startswith(b"ULog"):
+            raise source.fault("a ULog by its first bytes, no DataFlash: rename it to .ulg")
+        if not head.startswith(bytes((0xA3, 0x95))):
+            if b"\0" in head:
+                raise source.fault("no DataFlash by its first bytes: copy it anew, or name it by its own suffix")
             reader = DFReader.DFReader_text(str(path))
             return Messages(source=source, messages=_of_text(reader, names, fields), parameters=dict(reader.params))
         with DFReader.DFReader_binary(str(path)) as reader:

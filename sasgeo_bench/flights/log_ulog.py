@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError, FlightError
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.flights.log_points import FlightLog, LogSource
 from sasgeo_bench.flights.log_streams import (
@@ -139,9 +139,14 @@ def read_topics(path: Path, names: tuple[str, ...]) -> Topics:
 def read_ulog(path: Path) -> FlightLog:
     """Read the flight of a ULog file; raise `FlightError` if it has no places, or is not sound."""
     topics = read_topics(path, TOPICS)
-    with known_fields(topics.source):
-        streams = streams_of(topics)
-    return flight_of(topics.source, streams)
+    try:
+        with known_fields(topics.source):
+            streams = streams_of(topics)
+        return flight_of(topics.source, streams)
+    except FlightError as error:
+        if topics.notes:  # they may be the cause
+            raise FlightError(f"{error} ({'; '.join(topics.notes)})") from error
+        raise
 
 
 def read_receivers(path: Path) -> list[Fixes]:

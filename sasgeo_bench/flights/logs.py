@@ -36,7 +36,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.geometry.projection import from_lonlat
 from sasgeo_bench.regions.region import Manifest, Region
-from sasgeo_bench.sensing.ground import read_dem
+from sasgeo_bench.sensing.dem import read_dem
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -77,6 +77,11 @@ class LocateRequest:
             raise ConfigError(f"--heading lies within -180 and 360 degrees, got {self.heading[0]:g}")
         if not 0 < self.most_false < 1:
             raise ConfigError(f"--most-false lies between 0 and 1, got {self.most_false!r}")
+        if self.told.dem is not None and not self.uses_position:
+            raise ConfigError(
+                "--dem tells the height of the ground at the position in a file: leave out --no-exif-position, or say "
+                "--height"
+            )
         if self.near is not None and not (abs(self.near[0]) <= 180 and abs(self.near[1]) <= 84):  # UTM ends there
             raise ConfigError(f"--near is longitude,latitude, degrees, got {self.near[0]:g},{self.near[1]:g}")
 
@@ -159,15 +164,18 @@ class Watch:
         return True
 
 
-def verdict(answer: Prediction, p_false: float | None, prior: Prior, most_false: float) -> tuple[Found, str]:
-    """Return whether a picture was found, and why not."""
+def verdict(
+    answer: Prediction, p_false: float | None, prior: Prior, *, side_m: float, most_false: float
+) -> tuple[Found, str]:
+    """Return whether a picture was found, and why not; `side_m` is that of the square of ground that was looked for."""
     if p_false is None:
         return "withheld", "P(false fix) is not calibrated for this matcher and segmenter"
     if p_false <= most_false:
         return "found", ""
     where = "on the map" if prior.radius_m is None else f"within {prior.radius_m:g} m"
     if p_false >= NOWHERE:
-        return "not on this map", f"no place {where} explains what is seen"
+        # The usual cause on the map: a height that is not that above the ground
+        return "not on this map", f"no place {where} explains what is seen, taken as {side_m:.0f} m wide"
     rivals = round(answer.diagnostics.get("modes_above", 1.0)) - 1
     alike = f"{counted(rivals, 'other place')} {where} {'looks' if rivals == 1 else 'look'} alike"
     weak = f"P(false fix) is above {most_false:g}"

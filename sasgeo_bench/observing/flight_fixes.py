@@ -173,7 +173,7 @@ def _of_task(task: Task, answers: Mapping[str, Prediction], flight: str | None, 
         begin_ns=times_ns[0],
         clock="utc" if is_utc else "flight",
         epsg=epsg,
-        credit=task.manifest.attribution or ATTRIBUTION,
+        credit=task.manifest.credit,
     )
 
 

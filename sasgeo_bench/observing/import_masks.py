@@ -142,7 +142,7 @@ def scaled(camera: Camera, rows: int, cols: int, name: str) -> Camera:
     if abs(across - down) > 1.0 / min(lens.width_px, lens.height_px, rows, cols):
         raise ImageError(
             f"the mask of {name} has {cols} x {rows} pixels, its picture {lens.width_px} x {lens.height_px}: it was "
-            "cut or turned"
+            "stretched (resize it to the shape of the picture), cut or turned"
         )
     return replace(camera, intrinsics=resized(lens, (cols, rows), (across, down)))
 

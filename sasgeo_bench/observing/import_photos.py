@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.core.errors import ConfigError, SasgeoError, counted, named
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, counted, named
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import NAME, plain
 from sasgeo_bench.geometry.pose import Prior
@@ -325,13 +325,23 @@ class TaskWriter:
     def tell_failed(self) -> None:
         """Tell which pictures could not be decoded, and why."""
         for why, names in self.failed_by.items():
-            tell(f"left out: {named(sorted(names), 'picture')} {why}")
+            tell(f"left out: {named(names, 'picture')} {why}")
 
     def put(self, suite: str, pairs: Callable[[str], Pairs], of: Sequence[PosedPicture], more: str = "") -> Task:
         """Write one task; `more` is a sentence on what it is."""
+        before = self._queries_sha256(suite)
         made = put_task(pairs(suite), self._origin(suite, of, more), self._hidden(len(of)), out=self.request.out)
+        if before not in (None, made.manifest.queries_sha256):
+            tell(f"{made.folder} held the queries of another import, which are replaced (another --name keeps both)")
         tell(f"{suite} on {self.state.region}: {counted(made.manifest.queries, 'query', 'queries')} in {made.folder}")
         return made
+
+    def _queries_sha256(self, suite: str) -> str | None:
+        """Return the hash of the queries of that name that are there already; None without sound ones."""
+        try:
+            return Task.open(self.request.out / "tasks" / suite / self.state.region).manifest.queries_sha256
+        except StoreError:
+            return None
 
     def _hidden(self, count: int) -> TruthManifest:
         return TruthManifest.model_validate(seed_record(self.request.seed) | {"count": count})
@@ -355,6 +365,8 @@ class TaskWriter:
             map_date=self.state.date.isoformat(),
             map_fingerprint=self.manifest.fingerprint,
             map_inputs_sha256=self.manifest.inputs_sha256,
+            licence=self.manifest.licence,
+            attribution=self.manifest.attribution,
             provenance=self.manifest.provenance,
             sites=len(pictures),
             epsg=self.manifest.epsg,
@@ -375,6 +387,9 @@ class TaskWriter:
             if seen is not None:
                 count += 1
                 yield self._pair(one, suite, _Asked(own.digest("query").hex()[:24], prior, own), seen)
+        # the most frequent reason first, with names in order: pictures were read in the order of their ids
+        by_count = sorted(self.failed_by.items(), key=lambda item: (-len(item[1]), item[0]))
+        self.failed_by = {why: sorted(names) for why, names in by_count}
         if not count:
             self.tell_failed()
             raise _nothing(self.request.pictures, self.failed_by)
@@ -450,7 +465,7 @@ class TaskWriter:
             kind="own picture",
             strength=next((step for step in _STEPS_M if step >= one.sigma_m), one.sigma_m),
             strength_unit=TRUTH_SIGMA,
-            unknown_share=seen.evidence.unknown_share,
+            unknown_share=seen.evidence.of_known_classes().unknown_share,  # what no one looks for is not hidden
             changed_share=0.0,
             feature_density=density,
             alias_index=None,

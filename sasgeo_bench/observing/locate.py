@@ -28,6 +28,7 @@ from sasgeo_bench.observing.fixes import SEGMENTER, Fix, Located, LocateRequest,
 from sasgeo_bench.observing.pictures import (
     OwnPicture,
     Sight,
+    Told,
     list_pictures,
     names_of,
     open_picture,
@@ -37,9 +38,9 @@ from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.packed_map import UNPACKED
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
-from sasgeo_bench.running.plan import hidden_below, matcher_code, segmenter_code
-from sasgeo_bench.running.segmenting import SegmenterProcess
-from sasgeo_bench.running.worker import Reach, Worker, guarded
+from sasgeo_bench.running.plugin_code import matcher_code, segmenter_code
+from sasgeo_bench.running.segmenter_process import SegmenterProcess
+from sasgeo_bench.running.worker import Reach, Worker, guarded, hidden_below
 from sasgeo_bench.sensing.birdseye import to_evidence
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.photos import MOST_BYTES
@@ -89,10 +90,7 @@ def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = No
                 key = asker.key(path, name)
                 fix = kept.get(key)
                 if fix is None or (watch is not None and not watch.is_shown(number, fix) and fix.view is not None):
-                    seen = asker.ask(path, name, key)
-                    fix = seen if isinstance(seen, Fix) else seen.fix
-                    if watch is not None and isinstance(seen, Seen):
-                        watch.seen(number, seen)
+                    fix = _watched(asker.ask(path, name, key), number, watch)
                     if fix.status != "failed":
                         file.write(json.dumps({"key": key, "fix": asdict(fix)}) + "\n")
                         file.flush()
@@ -105,6 +103,15 @@ def locate(request: LocateRequest, watching: Callable[[Path], Watch] | None = No
             fixes=tuple(fixes),
             calibration=asker.calibration,
         )
+
+
+def _watched(seen: Seen | Fix, number: int, watch: Watch | None) -> Fix:
+    """Show a picture to a watch, and return its fix; nothing else of it is kept while the next one is asked."""
+    if isinstance(seen, Fix):
+        return seen
+    if watch is not None:
+        watch.seen(number, seen)
+    return seen.fix
 
 
 def read_answers(path: Path) -> dict[str, Fix]:
@@ -187,9 +194,9 @@ class _Asker:
             hidden=[*hidden, *(request.out.resolve() / name for name in ("regions", UNPACKED))],
             is_sandboxed=request.is_sandboxed,
         )
-        self._segmenter = SegmenterProcess(spec=request.segmenter, reach=reach, limits=request.limits)
+        self._segmenter = SegmenterProcess(spec=request.segmenter, reach=reach, limits=request.limits, is_lean=True)
         reach = Reach(readable=[region.resolve()], hidden=hidden, is_sandboxed=request.is_sandboxed)
-        self._worker = Worker(spec=request.matcher, reach=reach, limits=request.limits)
+        self._worker = Worker(spec=request.matcher, reach=reach, limits=request.limits, is_lean=True)
         self._threads = ThreadPoolExecutor(3)
         self._codes: Future[tuple[str, str]] = self._threads.submit(
             lambda: (matcher_code(request.matcher), segmenter_code(request.segmenter))
@@ -387,7 +394,7 @@ class _Asker:
             east_m, north_m, _ = to_grid(*picture.lonlat, self._manifest.epsg)
             away_m = round(math.hypot(stood.easting_m - east_m, stood.northing_m - north_m), 2)
         p_false = None if self.chances is None else round(self.chances.p_false(answer), 4)
-        status, reason = verdict(answer, p_false, prior, self._request.most_false)
+        status, reason = verdict(answer, p_false, prior, side_m=sight.side_m, most_false=self._request.most_false)
         return replace(
             known,
             status=status,
@@ -419,11 +426,18 @@ def answer_key(request: LocateRequest, manifest: Manifest, codes: tuple[str, str
         request.radius_m,
         request.heading,
         request.is_turned,
-        asdict(request.told),
+        _told(request.told),
         request.uses_position,
         request.most_false,
     ]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _told(told: Told) -> dict[str, float | str]:
+    """Return what a user says of pictures; keys are as before without a file of heights."""
+    said = asdict(replace(told, dem=None))
+    del said["dem"]
+    return said | ({} if told.dem is None else {"dem": _content(told.dem)})
 
 
 def fault_of(matcher: str, answer: Prediction) -> str:

@@ -16,7 +16,7 @@ import pyproj
 from sasgeo_bench.core.errors import FlightError, PoseError, SasgeoError, counted, named
 from sasgeo_bench.core.texts import plain
 from sasgeo_bench.flights.log_points import AltitudeOf as LogAltitudeOf
-from sasgeo_bench.observing.picture_poses import AltitudeOf, PicturePose, PoseTable
+from sasgeo_bench.observing.picture_poses import FLIGHT_LOG, AltitudeOf, PicturePose, PoseTable
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M
 from sasgeo_bench.observing.tracks import LOOKS_DOWN, Moment, Track, read_track
 from sasgeo_bench.sensing.photos import Photo, read_photo
@@ -98,7 +98,7 @@ def poses_by_log(log: Path, photos: Mapping[str, Path], *, offset_s: float | Non
         *(note for note in track.notes if is_looked_up or note != LOOKS_DOWN),
     )
     out = {why: tuple(names) for why, names in left_out.items()}
-    return PoseTable(path=log, kind="flight log", poses=tuple(poses), left_out=out, notes=notes)
+    return PoseTable(path=log, kind=FLIGHT_LOG, poses=tuple(poses), left_out=out, notes=notes)
 
 
 def _apart(poses: Sequence[PicturePose], taken: Mapping[str, Photo]) -> list[str]:

@@ -33,6 +33,7 @@ NONE: Final = "none"  # of a legend: nothing of any class that it names is there
 UNKNOWN: Final = "unknown"
 MOST_PIXELS: Final = 64_000_000
 _MOST_BYTES: Final = 2**30
+_BACKGROUNDS: Final = ("0", "#000000")
 _MOST_STRANGE: Final = 0.5  # of the pixels that are not background: of more, the legend is of other masks
 _COLOUR: Final = re.compile(r"#[0-9a-f]{6}")
 _VALUE: Final = re.compile(r"[0-9]{1,5}")
@@ -74,6 +75,18 @@ class Legend(Document):
         if len(found) < len(given):
             raise ValueError(f"a value stands there twice, as in '1' and '01': {', '.join(given)}")
         return found
+
+    @field_validator("bands", mode="before")
+    @classmethod
+    def _mean_one_class_each(cls, given: object) -> object:
+        several = (
+            next((key for key, one in given.items() if isinstance(one, list)), None)
+            if isinstance(given, dict)
+            else None
+        )
+        if several is not None:
+            raise ValueError(f"a band holds the chances of one class, got several for {several!r}: name one")
+        return given
 
     @field_validator("bands")
     @classmethod
@@ -287,11 +300,19 @@ def _of_colours(
 def _note(
     path: Path, missing: Mapping[str, int], total: int, empty: int, known: Mapping[str, Meaning], strange: Strange
 ) -> None:
-    """Count pixels that the legend does not name; refuse a mask of which most that is not background is such."""
+    """Count pixels that the legend does not name; refuse a mask of which most that is not background is such.
+
+    The error has one value alone, that of a background if it can, so that masks with one fault are counted together.
+    """
     if sum(missing.values()) > _MOST_STRANGE * (total - empty):
+        shown = next((one for one in _BACKGROUNDS if one in missing), max(missing, key=lambda one: missing[one]))
+        fault = f"most of what {path.name} holds is not in the legend, such as {shown}"
+        if shown in _BACKGROUNDS:
+            key = f'"{shown}"' if shown.startswith("#") else shown
+            raise ImageError(f'{fault}: if that is the background, say {key} = "none"')
         raise ImageError(
-            f"most of what {path.name} holds is not in the legend ({', '.join(list(missing)[:_SHOWN])}): was the mask "
-            f"stretched to grey levels, or is the legend ({', '.join(list(known)[:_SHOWN])}) of others?"
+            f"{fault}: was the mask stretched to grey levels, or is the legend ({', '.join(list(known)[:_SHOWN])}) of "
+            "others?"
         )
     strange.counts.update(missing)
 
@@ -312,10 +333,9 @@ def _chances(path: Path, plane: NDArray[Any]) -> NDArray[np.uint8]:
     if plane.dtype == np.uint8:
         values = np.unique(plane)
         if 0 < int(values[values < 255].max(initial=0)) < _FEW:
-            shown = ", ".join(map(str, values[:_SHOWN].tolist()))
             raise ImageError(
-                f"{path.name} holds {shown}: these look like values of classes, which [values] reads; chances of 8 "
-                "bits go from 0 to 255"
+                f"{path.name} holds few numbers, all below {_FEW}: these look like values of classes, which [values] "
+                "reads; chances of 8 bits go from 0 to 255"
             )
         return np.floor(plane / 255 * CERTAIN + 0.5).astype(np.uint8)
     if plane.dtype.kind != "f":
@@ -323,14 +343,16 @@ def _chances(path: Path, plane: NDArray[Any]) -> NDArray[np.uint8]:
     known = np.isfinite(plane)
     least, most = (float(plane[known].min()), float(plane[known].max())) if known.any() else (0.0, 0.0)
     if least < 0 or most > 1:
+        beyond = "below 0" if least < 0 else "above 1"
         raise ImageError(
-            f"{path.name} holds {least:g} to {most:g}, chances lie within 0 to 1: if they are logits, take the sigmoid"
+            f"{path.name} holds numbers {beyond}, chances lie within 0 to 1: if they are logits, take the sigmoid"
         )
     filled = np.where(known, plane, 0)
     return np.where(known, np.floor(filled * CERTAIN + 0.5), SILENT).astype(np.uint8)
 
 
-def _of_array(path: Path, legend: Legend, strange: Strange) -> Segmentation:
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file of numpy by name; that of an npy has none."""
     try:
         data = read_bounded(path, _MOST_BYTES)
         if path.suffix.lower() == ".npz":
@@ -338,15 +360,18 @@ def _of_array(path: Path, legend: Legend, strange: Strange) -> Segmentation:
                 if sum(item.file_size for item in archive.infolist()) > _MOST_BYTES:
                     raise ImageError(f"{path.name} unpacks to more than {_MOST_BYTES} bytes: cut the picture first")
             loaded = np.load(io.BytesIO(data), allow_pickle=False)
-            arrays = {name: loaded[name] for name in loaded.files}
-        else:
-            arrays = {"": np.load(io.BytesIO(data), allow_pickle=False)}
+            return {name: loaded[name] for name in loaded.files}
+        return {"": np.load(io.BytesIO(data), allow_pickle=False)}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         if isinstance(error, ImageError):
             raise
         raise ImageError(
             f"{path.name} is no array that can be read ({one_line(str(error))[:120]}): save it anew"
         ) from error
+
+
+def _of_array(path: Path, legend: Legend, strange: Strange) -> Segmentation:
+    arrays = _arrays(path)
     named_planes = all(array.ndim == 2 for array in arrays.values()) and len({a.shape for a in arrays.values()}) == 1
     if legend.bands and path.suffix.lower() == ".npz" and named_planes:
         return _of_probabilities(path, np.stack(list(arrays.values())), list(arrays), legend)
@@ -358,6 +383,11 @@ def _of_array(path: Path, legend: Legend, strange: Strange) -> Segmentation:
     if legend.bands:
         if array.ndim != 3:
             raise ImageError(f"{path.name} has shape {array.shape}, chances (classes, rows, columns)")
+        if array.shape[2] < min(array.shape[:2]):  # (rows, columns, classes): no picture is that narrow
+            raise ImageError(
+                f"{path.name} has its shortest axis last: chances are read as (classes, rows, columns), transpose them "
+                "(numpy.moveaxis(chances, -1, 0))"
+            )
         return _of_probabilities(path, array, [""] * len(array), legend)
     if array.ndim != 2:
         raise ImageError(f"{path.name} has shape {array.shape}, a mask (rows, columns)")

@@ -29,6 +29,8 @@ AltitudeOf = Literal["sea", "ellipsoid", "unstated"]
 Clock = Literal["utc", "local", "own"]
 PitchZero = Literal["down", "horizon"]
 
+FLIGHT_LOG: Final = "flight log"  # the kind of a table whose rows are the photos themselves, joined by time
+STRAIGHT_DOWN: Final = "say --poses: a column gimbal_pitch of -90 says straight down"
 FARTHEST_M: Final = 50_000.0  # of a row from the median of all: no battery lasts so long
 SWAPPED: Final = "whose longitude and latitude are swapped"
 _LEVEL_DEG: Final = 85.0  # of tilt: a camera that leans more shows the horizon
@@ -177,9 +179,9 @@ class PoseTable:
     def lines(self) -> list[str]:
         """Return what a user is told: format and count, then each reason with the first few rows, then the notes."""
         start = f"{plain(self.path.name)} ({self.kind}): {counted(len(self.poses), 'pose')}"
-        out = [
-            f"left out: {named([plain(name) for name in names], 'row')} {why}" for why, names in self.left_out.items()
-        ]
+        # The rows of a log are the photos themselves, whose reasons are told with those of all pictures.
+        rows = {} if self.kind == FLIGHT_LOG else self.left_out
+        out = [f"left out: {named([plain(name) for name in names], 'row')} {why}" for why, names in rows.items()]
         return [start, *out, *self.notes]
 
     def find(self, picture: str | Path) -> PicturePose | None:
@@ -204,6 +206,21 @@ class PoseTable:
                 f"of {plain(self.path.name)}: keep the folders that the table names"
             )
         return self.poses[best[0]] if best else None
+
+    def why_not(self, picture: str) -> str:
+        """Return why there is no pose of a picture, as in "2 pictures ..."."""
+        if self.kind == FLIGHT_LOG:
+            return next((why for why, names in self.left_out.items() if picture in names), "that the log does not tell")
+        rows = {_parts(name)[-1] for names in self.left_out.values() for name in names}
+        is_left_out = _parts(picture)[-1] in rows
+        return "whose row is left out" if is_left_out else "that the table does not name, or in another folder"
+
+    @property
+    def angles_hint(self) -> str:
+        """Return how angles of cameras can be told, of which neither photos nor this table say any."""
+        if self.kind == FLIGHT_LOG:
+            return f"{plain(self.path.name)} has no headings: name a log that has, or a table with gimbal_pitch"
+        return STRAIGHT_DOWN
 
     @cached_property
     def _by_name(self) -> Mapping[str, list[int]]:

@@ -21,16 +21,17 @@ from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import CRSError, RasterioError
 from rasterio.vrt import WarpedVRT
 
-from sasgeo_bench.core.errors import CameraError, GridError, ImageError, SasgeoError
+from sasgeo_bench.core.errors import CameraError, ConfigError, GridError, ImageError, SasgeoError
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.progress import tell
-from sasgeo_bench.geometry.grid import utm_epsg
+from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.pose import Pose, bearing_deg
 from sasgeo_bench.geometry.projection import to_grid
 from sasgeo_bench.regions.layers import find_bands, selected
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
-from sasgeo_bench.sensing.ground import Plane
+from sasgeo_bench.sensing.dem import read_dem
+from sasgeo_bench.sensing.ground import Dem, Plane
 from sasgeo_bench.sensing.image import AerialImage, decode_image
 from sasgeo_bench.sensing.photos import MOST_BYTES, Photo, read_photo
 from sasgeo_bench.sensing.video import SUFFIXES as VIDEOS
@@ -49,6 +50,8 @@ _CELLS_M: Final = (0.5, 1.0)
 _MARGIN: Final = 1.25  # times the view's side is what is cut out of a picture
 _MERIDIAN_DEG: Final = 9.0
 _STRAIGHT: Final = "taken as seen from straight above"
+_DEM_CELL_M: Final = 10.0  # of the lattice of heights; GLO-30 and SRTM have 30 m
+_AROUND_M: Final = 400.0  # of ground around the cameras whose heights are read
 _STEPS: Final = 41  # places along the axis of a tilted camera, where its view may lie
 
 
@@ -56,13 +59,17 @@ _STEPS: Final = 41  # places along the axis of a tilted camera, where its view m
 class Told:
     """What a user says of pictures, in place of what their files say or lack; None where he says nothing.
 
-    `height_m` is the height above the ground, `ground_width_m` how wide the ground in the picture is.
+    `height_m` is the height above the ground, `ground_width_m` how wide the ground in the picture is. `dem`, a GeoTIFF,
+    tells the height of photos that state an altitude and none above take-off.
     """
 
     height_m: float | None = None
     ground_width_m: float | None = None
+    dem: Path | None = None
 
     def __post_init__(self) -> None:
+        if self.dem is not None and (self.height_m is not None or self.ground_width_m is not None):
+            raise ConfigError("the size on the ground is told in one way: give --height, --ground-width or --dem alone")
         for name, most in (("height_m", 10_000.0), ("ground_width_m", 100_000.0)):
             value = getattr(self, name)
             if value is not None and not 0 < value <= most:
@@ -214,7 +221,9 @@ def open_picture(path: Path, told: Told | None = None) -> OwnPicture:
     """
     told = told or Told()
     if path.suffix.lower() in (".tif", ".tiff") and (found := _georeferenced(path)) is not None:
-        return found if told == Told() else replace(found, note="height and width passed over: its georeference tells")
+        names = {"--height": told.height_m, "--ground-width": told.ground_width_m, "--dem": told.dem}
+        given = " and ".join(name for name, value in names.items() if value is not None)
+        return replace(found, note=f"{given} passed over: its georeference tells its size") if given else found
     if path.suffix.lower() in (".png", ".webp"):  # without metadata of a drone that anybody writes
         return _plain(path, told)
     return _of_photo(path, read_photo(path), told)
@@ -244,6 +253,11 @@ def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
             return known
         raise CameraError(f"{path.name} says how its camera stood: say --height in place of --ground-width")
     height_m = photo.height_m if told.height_m is None else told.height_m
+    if height_m is None and told.dem is not None:
+        height_m = _height_over(told.dem, path.name, photo, lonlat)
+        known = replace(
+            known, note="; ".join(filter(None, [known.note, f"height above the ground by {told.dem.name}"]))
+        )
     if height_m is None:
         raise CameraError(
             f"{path.name} does not say how high the drone was: say --height in metres above the ground, or "
@@ -273,6 +287,45 @@ def _of_photo(path: Path, photo: Photo, told: Told) -> OwnPicture:
         camera=sensor.above_origin(),
         height_m=height_m,
     )
+
+
+def _height_over(dem: Path, name: str, photo: Photo, lonlat: tuple[float, float] | None) -> float:
+    """Return how high a photo was taken above the ground beneath it."""
+    if lonlat is None:
+        raise CameraError(f"{name} has no position, at which --dem tells the ground: say --height above the ground")
+    epsg = utm_epsg(*lonlat)
+    place_m = np.array([to_grid(*lonlat, epsg)[:2]])
+    ground_m = float(ground_around(dem, place_m, epsg).heights_m(place_m)[0])
+    found = height_above(ground_m, photo.altitude_m, is_ellipsoidal=photo.is_ellipsoidal)
+    if isinstance(found, str):
+        raise CameraError(f"{name} is a photo {found}: say --height above the ground")
+    return found
+
+
+def ground_around(dem: Path, places_m: NDArray[np.float64], epsg: int) -> Dem:
+    """Read the heights of the ground around cameras, (N, 2); raise `ConfigError` if they cannot be read, or end there.
+
+    Both they and altitudes of pictures are taken to count from the sea.
+    """
+    low, high = places_m.min(axis=0) - _AROUND_M, places_m.max(axis=0) + _AROUND_M
+    grid = Grid.from_bounds(*low.tolist(), *high.tolist(), cell_size_m=_DEM_CELL_M, epsg=epsg)
+    try:
+        return read_dem(dem, grid)
+    except CameraError as error:
+        raise ConfigError(str(error)) from error
+
+
+def height_above(ground_m: float, altitude_m: float | None, *, is_ellipsoidal: bool) -> float | str:
+    """Return the height of a camera above the ground, metres, or why it is not known.
+
+    >>> height_above(430.0, 512.5, is_ellipsoidal=False), height_above(430.0, None, is_ellipsoidal=False)
+    (82.5, 'without an altitude')
+    """
+    if altitude_m is None:
+        return "without an altitude"
+    if is_ellipsoidal:
+        return "whose altitude counts from the ellipsoid, where the ground's heights do from the sea: convert it"
+    return altitude_m - ground_m if math.isfinite(ground_m) else "beyond the heights of the ground"
 
 
 def _georeferenced(path: Path) -> OwnPicture | None:

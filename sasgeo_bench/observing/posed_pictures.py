@@ -20,15 +20,16 @@ from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError, Sasge
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.texts import plain
-from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import WGS84, to_grid
-from sasgeo_bench.observing.picture_poses import PicturePose, PoseTable, picture_heading_deg
+from sasgeo_bench.observing.picture_poses import STRAIGHT_DOWN, PicturePose, PoseTable, picture_heading_deg
 from sasgeo_bench.observing.pictures import (
     LEAST_M,
     STEEPEST_DEG,
     WIDEST_M,
     OwnPicture,
+    ground_around,
+    height_above,
     largest_square,
     list_pictures,
     names_of,
@@ -36,16 +37,14 @@ from sasgeo_bench.observing.pictures import (
     resized,
 )
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
-from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
+from sasgeo_bench.sensing.ground import Dem, Plane
 from sasgeo_bench.sensing.photos import DJI, MOST_BYTES, Photo, PhotoHead, number_of, photo_of, read_head
 
 GPS_SIGMA_M: Final = 3.3  # of one axis: 95 % within 8 m, as the GPS performance standard of 2020 states it
 _TILT_SIGMA: Final = 0.0175  # metres to a metre of height: a gimbal is right to a degree
 _SAME_SHAPE: Final = 0.01  # by which the aspects of a picture and of a smaller copy differ, from rounding
-_CELL_M: Final = 10.0  # of the lattice of heights; GLO-30 and SRTM have 30 m
 _NADIR_DEG: Final = 5.0  # of tilt: a camera that leans less looks straight down, but for the wind
 _FINE_M: Final = 0.5  # of a standard deviation, below which the datum of a place counts: plates move by 0.02 m a year
-_AROUND_M: Final = 400.0  # of ground around the cameras whose heights are read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,10 +158,11 @@ def pose_pictures(
                     continue
             row = None if table is None else table.find(name)
             if table is not None and row is None:
-                found.left_out["that the table does not name, or in another folder"].append(name)
+                found.left_out[table.why_not(name)].append(name)
                 continue
             taken[row.name if row is not None else ""] += 1
-            stand = _stand(path, name, row, epsg, sigma_m)
+            hint = STRAIGHT_DOWN if table is None else table.angles_hint
+            stand = _stand(path, name, row, hint, epsg=epsg, sigma_m=sigma_m)
         except SasgeoError as error:
             found.left_out[f"that cannot be read ({reason_of(error, path)})"].append(name)
             continue
@@ -176,6 +176,7 @@ def pose_pictures(
     headings = Counter(stand.heading_note for stand in seen if stand.heading_note)
     found.notes += [f"{note} ({counted(count, 'picture')})" for note, count in headings.items()]
     found.notes += _clocks(seen)
+    found.notes += _passed_over(heights, found.pictures)
     seen = _in_one_zone(seen, found)
     found.notes += _datums(seen)
     ground = _ground(heights, seen, epsg, found) if seen else None
@@ -281,8 +282,10 @@ def _fitted(lens: Intrinsics, photo: Photo) -> Intrinsics | None:
     return resized(lens, (photo.width_px, photo.height_px), (across, down))
 
 
-def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: float | None) -> _Stand | str:
-    """Return where a photo was taken, or why that is not known."""
+def _stand(
+    path: Path, name: str, row: PicturePose | None, hint: str, *, epsg: int, sigma_m: float | None
+) -> _Stand | str:
+    """Return where a photo was taken, or why that is not known; `hint` says how angles of cameras can be told."""
     photo, of_file_m = _photo(path)
     heading_note = ""
     if row is not None:
@@ -299,7 +302,7 @@ def _stand(path: Path, name: str, row: PicturePose | None, epsg: int, sigma_m: f
     if photo.lon_deg is None or photo.lat_deg is None:
         return "without a position (say --poses or --track, or copy the drone's own files)"
     if photo.gimbal is None:
-        return "without angles of the camera (say --poses: a column gimbal_pitch of -90 says straight down)"
+        return f"without angles of the camera ({hint})"
     place_m = to_grid(photo.lon_deg, photo.lat_deg, epsg)[:2] if row is None else row.in_crs(epsg)
     stated = of_file_m if row is None else row.sigma_m
     stated = sigma_m if stated is None else stated
@@ -360,6 +363,13 @@ def _clocks(seen: Sequence[_Stand]) -> list[str]:
     return [f"clocks disagree: the table is {off}; the table's times are taken"]
 
 
+def _passed_over(heights: Heights, georeferenced: Sequence[PosedPicture]) -> list[str]:
+    """Return a line where heights are given for pictures that need none."""
+    if heights == Heights() or not georeferenced:
+        return []
+    return [f"heights are passed over of {counted(len(georeferenced), 'georeferenced picture')}: each tells its size"]
+
+
 def _datums(seen: Sequence[_Stand]) -> list[str]:
     """Return a line where places are so good that it counts by which datum they are, and none says so."""
     fine = [stand for stand in seen if stand.sigma_m < _FINE_M and (stand.row is None or stand.row.epsg == WGS84)]
@@ -391,13 +401,7 @@ def _ground(heights: Heights, seen: Sequence[_Stand], epsg: int, found: PosedPic
     """Read the heights of the ground around all cameras, and say what they count from."""
     if heights.dem is None:
         return None
-    places = np.array([stand.place_m for stand in seen])
-    low, high = places.min(axis=0) - _AROUND_M, places.max(axis=0) + _AROUND_M
-    grid = Grid.from_bounds(*low.tolist(), *high.tolist(), cell_size_m=_CELL_M, epsg=epsg)
-    try:
-        dem = read_dem(heights.dem, grid)
-    except CameraError as error:
-        raise ConfigError(str(error)) from error
+    dem = ground_around(heights.dem, np.array([stand.place_m for stand in seen]), epsg)
     found.notes.append(
         f"heights of the ground by {heights.dem.name}, taken to be above the sea as GLO-30 (EGM2008) and SRTM (EGM96) "
         "are; altitudes of the pictures as well: they may differ by the receiver's own geoid"
@@ -462,15 +466,11 @@ def _height(stand: _Stand, heights: Heights, dem: Dem | None, at_m: tuple[float,
             if (stand.height_m is None)
             else stand.height_m
         )
-    if altitude_m is None:
-        return "without an altitude"
-    if of == "ellipsoid":
-        return "whose altitude counts from the ellipsoid, where the ground's heights do from the sea: convert it"
-    if heights.takeoff_m is not None:
-        return altitude_m - heights.takeoff_m
-    assert dem is not None  # noqa: S101 - one of both
-    ground_m = float(dem.heights_m(np.array([at_m]))[0])
-    return altitude_m - ground_m if np.isfinite(ground_m) else "beyond the heights of the ground"
+    ground_m = heights.takeoff_m
+    if ground_m is None:
+        assert dem is not None  # noqa: S101 - one of both
+        ground_m = float(dem.heights_m(np.array([at_m]))[0])
+    return height_above(ground_m, altitude_m, is_ellipsoidal=of == "ellipsoid")
 
 
 def lenses_of(pictures: Sequence[PosedPicture]) -> Mapping[str, int]:

@@ -26,7 +26,7 @@ from sasgeo_bench.observing.fixes import COLUMNS, Fix, Located, Seen, Watch
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.layers import read_layers, read_overview
-from sasgeo_bench.regions.preview import HIDDEN, paint_evidence, paint_overview, pooled
+from sasgeo_bench.regions.painting import HIDDEN, paint_evidence, paint_overview, pooled
 from sasgeo_bench.regions.region_files import LAYERS, read_manifest
 from sasgeo_bench.sensing.birdseye import rectify
 from sasgeo_bench.sensing.ground import Plane

@@ -40,6 +40,8 @@ _RECORD: Final = "frames.json"
 _VERSION: Final = 1  # raised when the same video gives other photos
 _QUALITY: Final = 92  # of JPEGs
 _SAMPLE: Final = 2**20  # bytes of each end of a video that tell it from others
+_NUMBER: Final = re.compile("[0-9]+")
+_ENDS_APART_S, _ENDS_APART = 3.0, 0.05  # seconds, and share of a video: its own track ends no farther from its end
 _XMP: Final = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
 <rdf:Description rdf:about="" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {}/></rdf:RDF></x:xmpmeta>"""
 
@@ -175,7 +177,7 @@ def _key(request: VideoRequest, track: Path | None) -> str:
         hashlib.sha256(ends).hexdigest(),
         about.st_size,
         about.st_mtime_ns,
-        None if track is None else sha256_of(track),
+        None if track is None else (track.name, sha256_of(track)),  # lines name it
         (request.every_s, request.fov_deg, request.offset_s),
     ]
     return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
@@ -378,11 +380,26 @@ class _Cutter:
             return _utc(self.video.created_s + time_s), ""
         return _utc(self.video.path.stat().st_mtime + time_s), ""
 
+    def _misfit(self, track: Track) -> str:
+        """Return why a track by the video's clock does not look like that of this video; empty where it does."""
+        if track.has_own_clock:
+            return ""
+        ours, theirs = self.video.path.stem.casefold(), track.path.stem.casefold()
+        if ours != theirs and _NUMBER.sub("#", ours) == _NUMBER.sub("#", theirs):
+            return "another number in its name"
+        ends_s, length_s = float(track.time_s[-1]), self.video.length_s
+        if length_s is None or abs(ends_s - length_s) <= max(_ENDS_APART_S, _ENDS_APART * length_s):
+            return ""
+        return f"it ends at {ends_s:.0f} s, the video at {length_s:.0f} s"
+
     def _tell(self) -> None:
         """Add what a user should know: of the track, of the lens, and of what was left out."""
         track, name = self.track, plain(self.video.path.name)
         if track is not None:
             self.lines[:0] = [f"{plain(track.path.name)}: {note}" for note in track.notes]
+            odd = self._misfit(track)
+            if odd:
+                self.lines.insert(0, f"{plain(track.path.name)} may be of another video than {name}: {odd}")
             if track.sigma_m is not None:
                 self.lines.append(f"{plain(track.path.name)}: places are rounded, good to {track.sigma_m:.1f} m")
             if track.began is None and track.log.start_s is None and self.video.created_s is None:

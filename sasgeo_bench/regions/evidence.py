@@ -177,6 +177,24 @@ class Evidence:
         """Return the fraction of unknown cells over all classes."""
         return float((self.cells == UNKNOWN).mean())
 
+    def of_known_classes(self) -> Self:
+        """Return the view without the classes that are unknown everywhere; as it is if all are.
+
+        >>> cells = np.array([[[PRESENT, UNKNOWN]], [[UNKNOWN, UNKNOWN]]], dtype=np.uint8)
+        >>> view = Evidence(classes=("building", "water"), cells=cells, cell_size_m=1.0)
+        >>> view.unknown_share, view.of_known_classes().unknown_share
+        (0.75, 0.5)
+        """
+        kept = (self.cells != UNKNOWN).any(axis=(1, 2))
+        if kept.all() or not kept.any():
+            return self
+        return type(self)(
+            classes=tuple(name for name, is_kept in zip(self.classes, kept, strict=True) if is_kept),
+            cells=self.cells[kept],
+            cell_size_m=self.cell_size_m,
+            confidence=None if self.confidence is None else self.confidence[kept],
+        )
+
     def replace(self, cells: NDArray[np.uint8], confidence: NDArray[np.uint8] | None = None) -> Self:
         """Return the same view with other cells (and confidence, none by default)."""
         return type(self)(classes=self.classes, cells=cells, cell_size_m=self.cell_size_m, confidence=confidence)

@@ -54,10 +54,11 @@ _DAY: Final = re.compile(
 class Place:
     """Where a region lies: a centre (degrees) and a size (width and height, metres), or bounds, degrees.
 
-    `country` is the name of its country, if it is known.
+    `country` is the name of its country, if it is known; `source` is what it was read out of, such as "log", if any.
     """
 
     country: str | None = None
+    source: str = ""
     center_lonlat: tuple[float, float] | None = None
     size_m: tuple[float, float] | None = None
     bounds_lonlat: Box | None = None
@@ -291,7 +292,7 @@ def new_region(
         region_text(fields, provenance={}, extracts=[nothing]), RegionFile, source=f"region {name}"
     ).grid()
     with scratch_folder("cut") as scratch:
-        found = _covering(grid, folders, days, most_mb=most_mb, scratch=scratch)
+        found = _covering(grid, folders, days, most_mb=most_mb, scratch=scratch, source=place.source)
         item = found.extract
         tell(item.to_text())
         fields["scenes"] = list(ground_of(found.reading, found.path, grid, at=item.date).scenes())
@@ -336,7 +337,9 @@ def _stated(found: Covering, grid: Grid) -> dict[str, object]:
     return {"coverage_parts_lonlat": [np.column_stack(change.transform(*ring.T)).round(6).tolist() for ring in rings]}
 
 
-def _covering(grid: Grid, folders: Sequence[Path], days: Days | None, *, most_mb: float, scratch: Path) -> Covering:
+def _covering(
+    grid: Grid, folders: Sequence[Path], days: Days | None, *, most_mb: float, scratch: Path, source: str
+) -> Covering:
     """Return what covers a grid, at hand or downloaded; raise `ExtractError` if nothing does."""
     places = extract_folders(folders)
     at_hand = list_at_hand(places, days=days)
@@ -350,7 +353,8 @@ def _covering(grid: Grid, folders: Sequence[Path], days: Days | None, *, most_mb
         (item for item in at_hand if any(shapely.box(*box).covers(turned) for box in item.header.boxes_lonlat)), None
     )
     if other is not None:
-        raise ExtractError(f"{lack}, and {other.path.name} covers {box_text(turned.bounds)}: longitude comes first")
+        mend = f"latitude and longitude look swapped in the {source}" if source else "longitude comes first"
+        raise ExtractError(f"{lack}, and {other.path.name} covers {box_text(turned.bounds)}: {mend}")
     if days is None and most_mb > 0:
         try:
             path = download_regional(area, most_mb=most_mb)

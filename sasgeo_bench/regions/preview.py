@@ -11,7 +11,6 @@ import numpy as np
 import shapely
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
@@ -21,15 +20,10 @@ from numpy.typing import NDArray
 from sasgeo_bench.core.canvas import PlainFigure
 from sasgeo_bench.core.errors import check_given
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
+from sasgeo_bench.regions.layers import OUTSIDE
+from sasgeo_bench.regions.painting import UNMAPPED, paint_overview, pooled
 from sasgeo_bench.regions.region import Manifest, Region
 
-PAINT_ORDER: Final = load_taxonomy().painted
-GROUND: Final = "#fbfaf5"
-HIDDEN: Final = "#9e9e9e"  # of what was not seen
-_UNMAPPED: Final = ("#d9d9d9", "#c4c4c4")
-_STRIPE_CELLS: Final = 12
 _DPI: Final = 110
 PREVIEW_CELLS: Final = 2048  # of `preview.png`, along the longest side
 _MOST_CELLS: Final = 1024  # of a figure, along a side: more are no more to see
@@ -84,22 +78,6 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
     _drawn(manifest, overview).savefig(
         path, metadata={"Title": manifest.title, "Copyright": manifest.attribution, "Software": None}, format="png"
     )
-
-
-def pooled(layers: NDArray[np.uint8], *, most_cells: int) -> NDArray[np.uint8]:
-    """Return coarser layers, at most `most_cells` along a side: present where any cell is, else the largest value.
-
-    Rows and columns that fill no whole cell at the lower and right edge are left out.
-
-    >>> pooled(np.array([[[0, 0, 1, 0]], [[0, 0, 255, 0]]], dtype=np.uint8).repeat(2, axis=1), most_cells=2).tolist()
-    [[[0, 1]], [[0, 255]]]
-    """
-    sides = layers.shape[1:]
-    step = max(1, min(-(-max(sides) // most_cells), *sides))
-    rows, cols = (side // step for side in sides)
-    parts = layers[:, : rows * step, : cols * step].reshape(len(layers), rows, step, cols, step)
-    is_there = (parts == PRESENT).any(axis=(2, 4))
-    return np.where(is_there, np.uint8(PRESENT), parts.max(axis=(2, 4)))
 
 
 def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
@@ -158,35 +136,6 @@ def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m
 def _cell_m(manifest: Manifest, overview: NDArray[np.uint8]) -> float:
     """Return the size of an overview cell: overviews are coarser by a whole factor."""
     return manifest.cell_size_m * round(manifest.cols / overview.shape[2]) if overview.shape[2] else 1.0
-
-
-def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the colours of a map, red, green and blue, shape (rows, cols, 3)."""
-    rows, cols = overview.shape[1:]
-    number = np.zeros((rows, cols), dtype=np.uint8)  # of a colour
-    colours = [GROUND]
-    for name in PAINT_ORDER:
-        if name in manifest.classes:
-            number[overview[manifest.classes.index(name)] == PRESENT] = len(colours)
-            colours.append(load_taxonomy()[name].colour)
-    down, right = np.indices((rows, cols), sparse=True)
-    is_stripe = (down + right) // _STRIPE_CELLS % 2 == 0
-    outside = overview[0] == OUTSIDE
-    number[outside] = (len(colours) + is_stripe)[outside]
-    palette = np.rint(255 * np.array([to_rgb(colour) for colour in (*colours, *_UNMAPPED)]))
-    return np.asarray(palette.astype(np.uint8)[number])
-
-
-def paint_evidence(evidence: Evidence) -> NDArray[np.float64]:
-    """Return colours of a view, shape (rows, cols, 3), 0..1; grey in proportion to the unknown classes."""
-    picture = np.empty((*evidence.shape, 3))
-    picture[:] = to_rgb(GROUND)
-    colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
-    for name in PAINT_ORDER:
-        if name in evidence.classes:
-            picture[evidence.layer(name) == PRESENT] = colours[name]
-    unknown = (evidence.cells == UNKNOWN).mean(axis=0)[..., None]
-    return np.asarray(picture * (1 - unknown) + np.array(to_rgb(HIDDEN)) * unknown)
 
 
 def scale_bar(chart: Axes, width_m: float, height_m: float) -> None:
@@ -268,7 +217,7 @@ def _legend(figure: Figure, manifest: Manifest, overview: NDArray[np.uint8], *, 
         entries.append(Patch(facecolor="none", edgecolor="none", label="all other classes: unknown"))
     if (overview[0] == OUTSIDE).any():
         hatched = Patch(
-            facecolor=_UNMAPPED[0], edgecolor=_UNMAPPED[1], hatch="////", lw=0.4, label="not mapped (unknown)"
+            facecolor=UNMAPPED[0], edgecolor=UNMAPPED[1], hatch="////", lw=0.4, label="not mapped (unknown)"
         )
         entries.append(hatched)
         entries.append(Line2D([], [], color=_EDGE, lw=1.0, label=f"edge of the map ({manifest.coverage.source})"))

@@ -14,10 +14,7 @@ from sasgeo_bench.core.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.core.plugins import (
     MATCHERS,
     ORACLE,
-    SEGMENTERS,
-    TRACKERS,
     list_entry_points,
-    plugin_code,
 )
 from sasgeo_bench.core.progress import check_jobs
 from sasgeo_bench.core.texts import MOST_CANDIDATES
@@ -29,50 +26,18 @@ from sasgeo_bench.regions.packed_map import UNPACKED, UnpackedMap
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import CARD
+from sasgeo_bench.running.plugin_code import matcher_code
 from sasgeo_bench.running.prediction_files import FollowerRecord, RunManifest
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training, root_of
-from sasgeo_bench.running.worker import Limits, Reach, Reply, Worker, loaded_card
+from sasgeo_bench.running.worker import Limits, Reach, Reply, Worker, hidden_below, loaded_card
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import Task, TaskManifest, answer_hash, dependency_key
-
-# Modules of this package that answers depend on, if a plugin imports them: after a change there, it is asked anew.
-TOOLS: Final = (
-    *("matching.controls", "matching.follower", "osm.taxonomy", "regions.evidence", "regions.graph"),
-    *("search", "sasgeo", "tasks.vectors"),
-)
-# The same of segmentations; segmenters look at pictures by all of them.
-SEGMENTER_TOOLS: Final = ("sensing.segmentation", "sensing.image", "sensing.camera")
-
-
-def matcher_code(spec: str) -> str:
-    """Return the SHA-256 of the code of a matcher or tracker (`files.code_hash.plugin_code`), and of the tools it uses.
-
-    >>> len(matcher_code("random")), matcher_code("random") == matcher_code("prior_centre")
-    (64, True)
-    """
-    # What every query is made of
-    return plugin_code(spec, MATCHERS, TRACKERS, tools=TOOLS, always=("regions.evidence",))
-
-
-def segmenter_code(spec: str) -> str:
-    """Return the SHA-256 of the code of a segmenter, and of all that pictures are looked at with.
-
-    >>> len(segmenter_code("colour_thresholds"))
-    64
-    """
-    return plugin_code(spec, SEGMENTERS, always=SEGMENTER_TOOLS)
-
 
 MOST_LINES: Final = 12  # tasks that are named; the others are counted
 MOST_TRAINED: Final = 2000  # pairs that travel to a process at once
 _MOST_S: Final = 7 * 86_400.0
 _BYTES_PER_MB = 10**6
-# Folders below a root that reveal truths, answers, or what pictures of later queries show.
-_HIDDEN: Final = (
-    *("tasks", "truth", "runs", "boards", "release", "results", "sheets", "sealed"),
-    *("segmenters", "private", "datasets", "head-start", "frames"),
-)
 MAPS: Final = ("regions/*", f"{UNPACKED}/*/*")  # below a root: built, and unpacked
 _LEAST_MB, _MOST_MB = 64, 4_000_000
 
@@ -390,11 +355,6 @@ def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
     maps = {path.resolve() for root in roots for kind in MAPS for path in root.glob(kind) if path.is_dir()}
     hidden += [*sorted(maps - set(readable)), *request.hidden]
     return Reach(readable=readable, hidden=hidden, is_sandboxed=request.is_sandboxed)
-
-
-def hidden_below(roots: Sequence[Path]) -> list[Path]:
-    """Return the folders below some roots of output that tell truths, tasks and answers."""
-    return [root / name for root in roots for name in _HIDDEN]
 
 
 def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:

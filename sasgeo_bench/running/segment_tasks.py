@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -23,7 +24,7 @@ from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frame_evidence import evidence_of, for_classes
-from sasgeo_bench.tasks.frames import read_labels
+from sasgeo_bench.tasks.frame_files import read_labels
 from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of, view_id
 from sasgeo_bench.tasks.segmented import Segmented, segmented_file, write_segmented
 from sasgeo_bench.tasks.split import HALVES, Split
@@ -267,7 +268,8 @@ def _image(query: Query, number: int) -> AerialImage:
 
 def _segmented(ready: _ReadySegmenter, task: Task) -> tuple[Path, list[str]]:
     """Segment one task unless that is done already; return the folder of the task that results, and what to tell."""
-    about, root = task.manifest, task.root
+    # what is printed is relative where the task was named so
+    about, root = task.manifest, task.root if task.folder.is_absolute() else Path(os.path.relpath(task.root))
     suite, record = name_of(about.suite, ready.name), ready.record(task)
     folder = root / "tasks" / suite / about.region
     if _is_made(folder, record, root):

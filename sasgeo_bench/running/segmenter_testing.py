@@ -12,7 +12,7 @@ import numpy as np
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import SEGMENTERS
 from sasgeo_bench.matching.segmenter import SegmenterCard
-from sasgeo_bench.running.segmenting import SegmenterProcess, SegmenterReply
+from sasgeo_bench.running.segmenter_process import SegmenterProcess, SegmenterReply
 from sasgeo_bench.running.testing import Check, Kit
 from sasgeo_bench.running.worker import Limits, Reach
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, write_labelled

@@ -1,29 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Serve a runner inside the sandbox: load, learn, prepare, match or step; every failure becomes a message."""
+"""Serve a runner for a matcher or a tracker, inside the sandbox: load, learn, prepare, match or step."""
 
-import errno
 import os
-import socket
-import time
-import traceback
-from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 import psutil
 
 from sasgeo_bench.core.errors import MatchError
-from sasgeo_bench.core.texts import message_of, one_line
 from sasgeo_bench.matching.follower import Follower
 from sasgeo_bench.matching.matcher import (
-    MOST_LEARNED_BYTES,
     Matcher,
     Training,
-    check_learned,
     check_match,
     is_followed,
 )
@@ -31,77 +23,14 @@ from sasgeo_bench.matching.plugins import load_method
 from sasgeo_bench.matching.tracker import ROW, Tracker, check_fix, match_of, row_of
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.running import wire
+from sasgeo_bench.running.server import Answer, Clock, PluginServer
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_files import pairs_from, query_from
 
 if TYPE_CHECKING:
     from sasgeo_bench.geometry.grid import Grid
-    from sasgeo_bench.matching.segmenter import Segmenter
-
-Answer = tuple[wire.Message, bytes]  # to a question that was answered, and the bytes that follow it
 
 MOST_MAPS: Final = 2  # cached while a matcher trains
-_REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
-
-
-Plugin = TypeVar("Plugin", bound="Matcher | Tracker | Segmenter")
-
-
-class PluginServer(ABC, Generic[Plugin]):
-    """Answers messages until the runner closes its end: each kind of question by the method of its name.
-
-    A method is given the bytes after the question, and its fields.
-    """
-
-    most_learned_bytes = MOST_LEARNED_BYTES
-
-    def __init__(self, channel: socket.socket, *, spec: str, luggage: bytes = b"") -> None:
-        self.channel = channel
-        self.spec = spec
-        self.luggage = luggage.decode()
-        self._made: Plugin | None = None
-
-    def run(self) -> None:
-        """Serve until the other side closes."""
-        while True:
-            try:
-                message, blob = wire.receive(self.channel)
-            except wire.Closed:
-                return
-            head = {"nonce": message["nonce"]}
-            fields = {name: value for name, value in message.items() if name not in {"kind", "nonce"}}
-            try:
-                content, data = getattr(self, f"_{message['kind']}")(blob, **fields)
-                answer = wire.packed({**head, "status": "ok", **content}, data)
-            except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
-                answer = wire.packed({**head, **_failure(error, plugin=self._made)})
-            try:
-                wire.put(self.channel, answer)
-            except wire.Closed:  # the runner waited no longer
-                return
-
-    @abstractmethod
-    def _make(self) -> Plugin:
-        """Import and make the plugin."""
-
-    @property
-    def plugin(self) -> Plugin:
-        """Return the plugin, made at the first question."""
-        if self._made is None:
-            self._made = self._make()
-        return self._made
-
-    def _load(self, _: bytes) -> Answer:
-        return {"card": asdict(self.plugin.card), "learns": callable(getattr(self.plugin, "learn", None))}, b""
-
-    def _learned(self, training: object) -> Answer:
-        learn = getattr(self.plugin, "learn", None)
-        if not callable(learn):
-            raise MatchError(f"{self.plugin.card.name} has no learn()")
-        with (used := Clock()):
-            learned = learn(training)
-        return {"seconds": used.seconds}, check_learned(learned, most_bytes=self.most_learned_bytes).encode()
 
 
 class Server(PluginServer[Matcher | Tracker]):
@@ -155,42 +84,6 @@ def _step(tracker: Tracker, query: Query, top_k: int) -> Answer:
     covariance = None if fix.covariance is None else tuple(np.asarray(fix.covariance).ravel().tolist())
     row = replace(row_of(match_of(fix), query.query_id), is_accepted=fix.is_accepted, covariance=covariance)
     return used.times(), ROW.dump_json(row)
-
-
-def _failure(error: Exception, *, plugin: object) -> wire.Message:
-    """Describe an error as an answer; an unforeseen one with the last line of the plugin's package on its way."""
-    if isinstance(error, MatchError):
-        return {"status": "invalid", "message": one_line(str(error))}
-    if isinstance(error, MemoryError):
-        return {"status": "crash", "message": "out of memory"}
-    is_refused = isinstance(error, OSError) and error.errno in _REFUSED
-    status = "refused" if is_refused else "crash"
-    package = str(type(plugin).__module__).partition(".")[0]
-    lines = [
-        f" ({Path(frame.f_code.co_filename).name}:{line})"
-        for frame, line in traceback.walk_tb(error.__traceback__)
-        if plugin is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == package
-    ]
-    return {"status": status, "message": one_line("".join([message_of(error), *lines[-1:]]))}
-
-
-class Clock:
-    """Seconds by the clock, and of the processors, while it is entered."""
-
-    def __init__(self) -> None:
-        self.seconds, self.cpu_s = 0.0, 0.0
-
-    def __enter__(self) -> Self:
-        self._start, self._start_cpu = time.perf_counter(), time.process_time()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.seconds += time.perf_counter() - self._start
-        self.cpu_s += time.process_time() - self._start_cpu
-
-    def times(self) -> wire.Message:
-        """Return both as part of an answer."""
-        return {"seconds": self.seconds, "cpu_s": self.cpu_s}
 
 
 class _Cost(Clock):

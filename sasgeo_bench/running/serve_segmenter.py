@@ -13,7 +13,7 @@ from sasgeo_bench.matching.segmenter import (
     Segmenter,
     check_segmentation,
 )
-from sasgeo_bench.running.serve import Answer, Clock, PluginServer
+from sasgeo_bench.running.server import Answer, Clock, PluginServer
 from sasgeo_bench.sensing.image import LabelledFiles, image_from
 
 

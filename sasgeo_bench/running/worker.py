@@ -48,13 +48,18 @@ from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.failures import LOG, is_disk_error, our_failure
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
-from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
+from sasgeo_bench.running.memory import LEAN, WATCH_S, Group, MemoryWatch
 from sasgeo_bench.running.wire import Message
 from sasgeo_bench.sensing.image import LABELLED
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_files import pairs_bytes
 
 _MOST_BYTES: Final = 2**50  # of memory
+# Folders below a root that reveal truths, answers, or what pictures of later queries show.
+_HIDDEN: Final = (
+    *("tasks", "truth", "runs", "boards", "release", "results", "sheets", "sealed"),
+    *("segmenters", "private", "datasets", "head-start", "frames"),
+)
 
 
 class Named(Protocol):
@@ -181,6 +186,11 @@ class Reach:
     is_sandboxed: bool = True
 
 
+def hidden_below(roots: Sequence[Path]) -> list[Path]:
+    """Return the folders below some roots of output that tell truths, tasks and answers."""
+    return [root / name for root in roots for name in _HIDDEN]
+
+
 @dataclass(kw_only=True)
 class PluginProcess(ABC, Generic[AnyCard, Found]):
     """The process of a plugin; a new one is started whenever the last one has ended.
@@ -197,6 +207,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
     reach: Reach
     limits: Limits
     luggage: str = ""  # that a process gets at its start
+    is_lean: bool = False  # whether it keeps little of what it freed, and takes a little longer
     isolation: dict[str, str] = field(default_factory=dict)
     starts: int = 0
     _peak_bytes: int = 0
@@ -316,7 +327,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            env=_environment(self._scratch),
+            env=_environment(self._scratch) | (LEAN if self.is_lean else {}),
             start_new_session=True,
         )
         theirs.close()

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.canvas import Page, page, without_ticks
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import GROUND, HIDDEN, class_keys, north_arrow, paint_evidence, scale_bar
+from sasgeo_bench.regions.painting import GROUND, HIDDEN, paint_evidence
+from sasgeo_bench.regions.preview import class_keys, north_arrow, scale_bar
 from sasgeo_bench.regions.region import Manifest
 
 UNIT: Final = "nats for 100 m\u00b2"

@@ -184,22 +184,29 @@ def check_gnss(
     )
 
 
-def summary(checks: Sequence[GnssCheck]) -> dict[str, float]:
+def summary(checks: Sequence[GnssCheck], paths: Sequence[str]) -> dict[str, float]:
     """Return figures over flights: alarms an hour, the share that is noticed, and how soon (median, 95 %).
 
-    Pull-offs that nobody notices count as infinite. "At most" is the upper end of a Poisson count at 95 %, one-sided,
-    as if all hours were independent; flights of one log are one path.
+    `paths` names the path of each flight: hours are those of distinct paths, as flights along one path with several
+    odometers share their views and so their errors. "At most" is the upper end of a Poisson count at 95 %, one-sided,
+    of the alarms of a flight on average over these hours. Pull-offs that nobody notices count as infinite.
 
-    >>> one = GnssCheck(fixes=9, hours=0.5, alarms_s=(3.0,), noticed_s=(10.0, 20.0, np.inf))
-    >>> figures = summary([one])
-    >>> figures["alarms_per_hour"], figures["alarms_per_hour_at_most"], figures["noticed"], figures["notice_p95_s"]
-    (2.0, 9.488, 0.667, inf)
+    Two flights of one path of half an hour; one of them alarms once:
+
+    >>> flights = [GnssCheck(fixes=9, hours=0.5, alarms_s=(3.0,)), GnssCheck(fixes=9, hours=0.5, alarms_s=())]
+    >>> summary(flights, ["a", "a"])
+    {'paths': 1, 'hours': 0.5, 'alarms_per_hour': 1.0, 'alarms_per_hour_at_most': 7.815}
+    >>> summary(flights, ["a", "b"])["alarms_per_hour_at_most"]
+    4.744
     """
-    hours, alarms = sum(one.hours for one in checks), sum(len(one.alarms_s) for one in checks)
+    flown = {path: one.hours for path, one in zip(paths, checks, strict=True)}
+    hours, alarms = sum(flown.values()), sum(len(one.alarms_s) for one in checks)
+    rate = alarms / sum(one.hours for one in checks) if hours else np.nan
     found = {
-        "alarms_per_hour": round(alarms / hours, 3) if hours else np.nan,
-        "alarms_per_hour_at_most": round(float(chi2.ppf(0.95, 2 * alarms + 2)) / 2 / hours, 3) if hours else np.nan,
+        "paths": len(flown),
         "hours": round(hours, 3),
+        "alarms_per_hour": round(rate, 3),
+        "alarms_per_hour_at_most": round(float(chi2.ppf(0.95, 2 * rate * hours + 2)) / 2 / hours, 3) if hours else rate,
     }
     times = np.array([time for one in checks for time in one.noticed_s])
     if len(times):

@@ -235,6 +235,20 @@ def own_metrics(
     return tuple({(own.metric.name, own.metric.tracks): own for own in found}.values())
 
 
+def stated_metrics(within: Sequence[str], requirements: Sequence["Requirement"] = ()) -> dict[str, MeanMetric]:
+    """Return by name the shares that limits and requirements ask for, also those that are on every board.
+
+    >>> list(stated_metrics(["10m,5deg"], parse_requirements(["80% within 50 m, p95 latency 400 ms"])))
+    ['success_10m', 'distance_within_10m_5deg', 'within_50m', 'distance_within_50m']
+    """
+    limits = [_limits(text, text.split(","), what=f"--within says {text!r}") for text in within]
+    names = [name for near in limits for name in (within_name(*near), _flown_name(*near))]
+    names += [name for one in requirements for name in one.figures.values() if not is_latency(name)]
+    own = {one.metric.name: one.metric for one in own_metrics(within, requirements)}
+    found = ((name, own.get(name, _SHIPPED.get(name))) for name in dict.fromkeys(names))
+    return {name: metric for name, metric in found if isinstance(metric, MeanMetric)}
+
+
 # --- requirements -----------------------------------------------------------------------------------------------------
 
 

@@ -2,7 +2,7 @@
 """Bird's-eye view: from a picture, or the class probabilities of its pixels, to a heading-up lattice on the ground."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Final, Protocol, Self
@@ -15,8 +15,9 @@ from sasgeo_bench.core.errors import CameraError, ShapeError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence, cell_offsets_m
-from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Dem, Ground
+from sasgeo_bench.sensing.segmentation import Segmentation
 
 Planes = NDArray[np.float32]
 
@@ -147,8 +148,8 @@ class BirdsEye:
         """Return which cells the picture shows, shape (rows, cols)."""
         return np.isfinite(self.points_px[:, :, 0])
 
-    def sample(self, planes: NDArray[np.floating]) -> Planes:
-        """Bring planes of a picture, shape (C, H, W), onto the lattice, (C, rows, cols); NaN where unseen or unknown.
+    def sample(self, planes: Iterable[NDArray[np.floating]]) -> Planes:
+        """Bring planes of a picture, (H, W) each, onto the lattice, (C, rows, cols); NaN where unseen or unknown.
 
         A picture much finer than the lattice is averaged first, so that a cell takes what lies in it, not one pixel.
         A cell is known if more than half of what it takes is.
@@ -156,14 +157,16 @@ class BirdsEye:
         factor = self._factor()
         at = (self.points_px / factor - _HALF).astype(np.float32)  # OpenCV counts from the centre of the first pixel
         where = np.nan_to_num(at, nan=-2.0)
-        found = np.full((len(planes), *self.is_seen.shape), np.nan, dtype=np.float32)
-        for plane, cells in zip(planes, found, strict=True):
+        found = []
+        for plane in planes:
+            cells = np.full(self.is_seen.shape, np.nan, dtype=np.float32)
             is_known = np.isfinite(plane)
             weight = self._take(is_known.astype(np.float32), where, factor)
             total = self._take(np.where(is_known, plane, 0).astype(np.float32), where, factor)
             enough = self.is_seen & (weight > _HALF)
             cells[enough] = total[enough] / weight[enough]
-        return found
+            found.append(cells)
+        return np.stack(found) if found else np.empty((0, *self.is_seen.shape), dtype=np.float32)
 
     def _factor(self) -> int:
         if not self.is_seen.any():
@@ -226,13 +229,8 @@ def see_ground(
     Raise `ShapeError` if the probabilities are not of the camera's picture.
     """
     reading = reading or Reading()
-    planes, lens = seen.probabilities(), camera.intrinsics
-    if planes.shape[1:] != (lens.height_px, lens.width_px):
-        raise ShapeError(
-            f"the camera's pictures are {lens.height_px} x {lens.width_px}, got probabilities {planes.shape}"
-        )
     lattice = BirdsEye.of(camera, ground, size_cells=size_cells, cell_size_m=cell_size_m, pose=pose)
-    found = lattice.sample(planes)
+    found = lattice.sample(_planes(seen, camera.intrinsics))
     hidden = np.zeros(lattice.is_seen.shape, dtype=bool)
     for name, height_m in reading.standing_m.items():
         if name in seen.classes:
@@ -243,6 +241,21 @@ def see_ground(
         with np.errstate(invalid="ignore"):
             found[index][lattice.gsd_m > reading.widths_m.get(name, math.inf)] = np.nan
     return SoftView(classes=seen.classes, probabilities=found, cell_size_m=cell_size_m)
+
+
+def _planes(seen: Seen, lens: Intrinsics) -> Iterator[Planes]:
+    """Yield P(present) of each class; of a `Segmentation` class by class: all take four times its own bytes."""
+    parts: Iterable[Seen] = (seen,)
+    if isinstance(seen, Segmentation):
+        pairs = zip(seen.classes, seen.probability_bytes[:, np.newaxis], strict=True)
+        parts = (Segmentation(classes=(name,), probability_bytes=plane) for name, plane in pairs)
+    for part in parts:
+        planes = part.probabilities()
+        if planes.shape[1:] != (lens.height_px, lens.width_px):
+            raise ShapeError(
+                f"the camera's pictures are {lens.height_px} x {lens.width_px}, got probabilities {planes.shape}"
+            )
+        yield from planes
 
 
 def to_evidence(

@@ -228,6 +228,15 @@ def altitude_m(xmp: Xmp) -> float | None:
     return _first(xmp, _ALTITUDE)
 
 
+def _exif_altitude(gps: Mapping[int, object]) -> tuple[float | None, bool]:
+    """Return the altitude that EXIF states, metres, and whether it counts from the ellipsoid (since EXIF 3.0)."""
+    metres, given = number_of(gps.get(ExifTags.GPS.GPSAltitude)), gps.get(ExifTags.GPS.GPSAltitudeRef, 0)
+    reference = given[0] if isinstance(given, bytes) and given else given
+    if metres is None or reference not in (0, 1, 2, 3):  # above and below the sea, and the same of the ellipsoid
+        return None, False
+    return (-metres if reference in (1, 3) else metres), reference in (2, 3)
+
+
 def is_ellipsoidal(altitude_type: str) -> bool:
     """Return whether DJI's AltitudeType says that an absolute altitude counts from the ellipsoid, as RTK's do.
 
@@ -570,6 +579,7 @@ def photo_of(name: str, head: PhotoHead, *, most_pixels: int = 200_000_000) -> P
         lon_deg = lat_deg = None
     make = _text(head.exif.get(ExifTags.Base.Make)) or head.xmp.get(("http://ns.adobe.com/tiff/1.0", "Make"), "")
     angles = camera_angles(head.xmp, make)
+    by_drone_m, (by_exif_m, is_exif_ellipsoidal) = altitude_m(head.xmp), _exif_altitude(head.gps)
     return Photo(
         name=name,
         width_px=width_px,
@@ -579,8 +589,10 @@ def photo_of(name: str, head: PhotoHead, *, most_pixels: int = 200_000_000) -> P
         lat_deg=lat_deg,
         place_fault=place_fault,
         height_m=height_above_m(head.xmp),
-        altitude_m=altitude_m(head.xmp),
-        is_ellipsoidal=is_ellipsoidal(head.xmp.get((DJI, "AltitudeType"), "")),
+        altitude_m=by_drone_m if by_drone_m is not None else by_exif_m,
+        is_ellipsoidal=is_ellipsoidal(head.xmp.get((DJI, "AltitudeType"), ""))
+        if by_drone_m is not None
+        else is_exif_ellipsoidal,
         gimbal=angles.attitude,
         gimbal_fault=angles.fault,
         flight=body_angles(head.xmp),

@@ -27,7 +27,7 @@ from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.edited_maps import changed_maps, degraded_map, edit_maps, nothing_to_ask
 from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer, LoggedFlight
-from sasgeo_bench.tasks.frames import LABELS
+from sasgeo_bench.tasks.frame_files import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.pictured_ground import PicturedGround
 from sasgeo_bench.tasks.private_seed import seed_record
@@ -383,6 +383,8 @@ def _origin(
         map_date=state.date.isoformat(),
         map_fingerprint=manifest.fingerprint,
         map_inputs_sha256=manifest.inputs_sha256,
+        licence=manifest.licence,
+        attribution=manifest.attribution,
         provenance=manifest.provenance,
         split=spec.id,
         split_sha256=hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),

@@ -3,18 +3,14 @@
 
 import datetime as dt
 import zlib
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ImageError
-from sasgeo_bench.core.parquet import open_table
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, UNKNOWN, pack, unpack
 
 # Every process of a matcher reads queries, and few look at pictures: what these need is imported where it is used.
@@ -22,29 +18,8 @@ if TYPE_CHECKING:
     from sasgeo_bench.sensing.camera import Camera
     from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 
-LABELS: Final = "labels.parquet"  # beside the truths: what is on each pixel of each frame
 MOST_PICTURE_BYTES: Final = 150_000
-_SIGMAS: Final = ("height_sigma_m", "attitude_sigma_deg", "position_sigma_m", "yaw_sigma_deg")
-
-FRAME: Final = pa.struct(
-    [
-        ("picture", pa.binary()),
-        ("width_px", pa.int32()),
-        ("height_px", pa.int32()),
-        *((name, pa.list_(pa.float64())) for name in ("focal_px", "centre_px", "distortion", "rotation")),
-        *((name, pa.float64()) for name in ("east_m", "north_m", "height_m", *_SIGMAS)),
-    ]
-)
-LABEL_SCHEMA: Final = pa.schema(
-    [
-        ("query_id", pa.string()),
-        ("frame", pa.int32()),
-        ("rows", pa.int32()),
-        ("cols", pa.int32()),
-        ("classes", pa.list_(pa.string())),
-        ("labels", pa.binary()),
-    ]
-)
+SIGMAS: Final = ("height_sigma_m", "attitude_sigma_deg", "position_sigma_m", "yaw_sigma_deg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +56,7 @@ class Frame:
             raise ImageError(
                 f"a picture has at most {MOST_PICTURE_BYTES} bytes, got {len(self.picture)}: compress it more"
             )
-        for name in _SIGMAS:
+        for name in SIGMAS:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise ImageError(f"{name} must be finite and not negative, got {value!r}")
@@ -159,57 +134,3 @@ def encode_webp(rgb: NDArray[np.uint8], *, most_bytes: int = MOST_PICTURE_BYTES)
     raise ImageError(
         f"a picture of {rgb.shape[1]} x {rgb.shape[0]} pixels does not fit into {most_bytes} bytes: make it smaller"
     )
-
-
-def frame_row(frame: Frame) -> dict[str, object]:
-    """Return a frame as a row of `FRAME`."""
-    lens = frame.camera.intrinsics
-    return {
-        "picture": frame.picture,
-        "width_px": lens.width_px,
-        "height_px": lens.height_px,
-        **{name: list(getattr(lens, name)) for name in ("focal_px", "centre_px", "distortion")},
-        "rotation": list(frame.camera.rotation),
-        **{name: getattr(frame.camera, name) for name in ("east_m", "north_m", "height_m")},
-        **{name: getattr(frame, name) for name in _SIGMAS},
-    }
-
-
-def frame_of(row: Mapping[str, Any]) -> Frame:
-    """Return the frame of a row of `FRAME`; raise as `Frame` and its camera do."""
-    from sasgeo_bench.sensing.camera import Camera, Intrinsics  # noqa: PLC0415 - see above
-
-    lens = Intrinsics(
-        width_px=row["width_px"],
-        height_px=row["height_px"],
-        **{name: tuple(row[name]) for name in ("focal_px", "centre_px", "distortion")},
-    )
-    stands = {name: row[name] for name in ("east_m", "north_m", "height_m")}
-    camera = Camera(intrinsics=lens, rotation=tuple(row["rotation"]), **stands)
-    return Frame(picture=row["picture"], camera=camera, **{name: row[name] for name in _SIGMAS})
-
-
-def label_row(query_id: str, number: int, item: FrameLabels) -> dict[str, object]:
-    """Return the labels of one frame as a row of `LABEL_SCHEMA`."""
-    return {
-        "query_id": query_id,
-        "frame": number,
-        "rows": item.rows,
-        "cols": item.cols,
-        "classes": list(item.classes),
-        "labels": item.packed,
-    }
-
-
-def read_labels(truth_folder: Path) -> Iterator[tuple[str, int, FrameLabels]]:
-    """Yield query id, number of the frame and its labels, one at a time, in the order of the queries.
-
-    Raise `StoreError` if the file is missing or damaged.
-    """
-    with open_table(truth_folder / LABELS, mend="make the queries again", is_whole=False) as source:
-        for batch in source.iter_batches(batch_size=1):
-            row = batch.to_pylist()[0]
-            labels = FrameLabels(
-                classes=tuple(row["classes"]), rows=row["rows"], cols=row["cols"], packed=row["labels"]
-            )
-            yield row["query_id"], row["frame"], labels

@@ -362,3 +362,13 @@ class Truth:
     measured: dict[str, float] = field(default_factory=dict)
     detector: Detector = PUBLISHED
     labels: tuple[FrameLabels, ...] = field(default=(), repr=False, compare=False)
+
+    @property
+    def is_own(self) -> bool:
+        """Return whether it is of a user's own picture, whose pose is as good as its file says."""
+        return self.strength_unit == TRUTH_SIGMA
+
+    @property
+    def title(self) -> str:
+        """Return role and kind; of a user's own picture, which is the control of nothing, the kind alone."""
+        return self.kind if self.is_own else f"{self.role}: {self.kind}"

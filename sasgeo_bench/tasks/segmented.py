@@ -10,14 +10,13 @@ from typing import Final, Self
 import cv2
 import numpy as np
 import pyarrow as pa
-from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.parquet import read_table, write_table
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.preview import PAINT_ORDER
+from sasgeo_bench.regions.painting import PAINT_ORDER, rgb_of
 from sasgeo_bench.sensing.segmentation import CERTAIN, SILENT, Segmentation
 
 MOST_PX: Final = 384  # along a side: they are shown small
@@ -71,14 +70,16 @@ class Segmented:
         >>> (seen.over(np.zeros((1, 2, 3), dtype=np.uint8)).std(axis=2) > 0).tolist()
         [[False, True]]
         """
-        colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
+        colours = {item.name: rgb_of(item.colour) for item in load_taxonomy().classes}
         drawn = cv2.resize(self.drawn, rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-        grey = 255 * _LIGHT + (1 - _LIGHT) * rgb.mean(axis=2, keepdims=True)
-        found = np.repeat(grey, 3, axis=2)
+        grey = 255 * _LIGHT + (1 - _LIGHT) * rgb.mean(axis=2)
+        # Colours in floating point would take 24 bytes of each pixel, and twice that on the way.
+        found = np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=2)
         for number, name in enumerate(PAINT_ORDER, start=1):
             here = drawn == number
-            found[here] = (1 - _VEIL) * found[here] + _VEIL * 255 * np.array(colours[name])
-        return np.asarray(np.rint(found), dtype=np.uint8)
+            veiled = (1 - _VEIL) * grey[here][:, None] + _VEIL * 255 * np.array(colours[name])
+            found[here] = np.rint(veiled)
+        return found
 
 
 def segmented_file(root: Path, queries_sha256: str) -> Path:

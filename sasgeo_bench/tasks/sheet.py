@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contact sheets: the views of queries, the map at the true place, the difference, and the map at a twin or decoy."""
 
+import datetime as dt
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,6 @@ import shapely
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
@@ -23,15 +23,27 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.canvas import Page, PlainFigure, page, panels, without_ticks
 from sasgeo_bench.core.errors import ConfigError, StoreError, counted
+from sasgeo_bench.flights.drift_profile import list_profiles, load_profile
 from sasgeo_bench.geometry.pose import Pose, reckon
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.layers import read_layers, read_overview
-from sasgeo_bench.regions.preview import GROUND, HIDDEN, paint_evidence, paint_overview
+from sasgeo_bench.regions.painting import GROUND, HIDDEN, paint_evidence, paint_overview, rgb_of
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
 from sasgeo_bench.tasks.build import rebuild_hint
-from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, TWIN_TURN, PriorGroup, Query, Truth, flight_id
+from sasgeo_bench.tasks.flight_sampling import UTC
+from sasgeo_bench.tasks.query import (
+    PUBLISHED,
+    TRUTH_SIGMA,
+    TWIN_EAST,
+    TWIN_NORTH,
+    TWIN_TURN,
+    PriorGroup,
+    Query,
+    Truth,
+    flight_id,
+)
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import changed_share
 from sasgeo_bench.tasks.suites.mining import describe, mine
@@ -48,6 +60,7 @@ _COLUMNS: Final = ("view", "map at the true place", "view against map")
 _CELL_INCHES: Final = 2.4
 _TEXT_INCHES: Final = 3.0  # width of the text column, readable when the sheet is shown smaller
 _DPI: Final = 100
+_EVEN: Final = 2  # of 254, the confidence of a class that is as likely as not, but for rounding
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,12 +82,39 @@ def paint_difference(seen: Evidence, mapped: Evidence) -> NDArray[np.float64]:
     known = (seen.cells != UNKNOWN) & (mapped.cells != UNKNOWN)
     one, two = (known & (item.cells == PRESENT) for item in (seen, mapped))
     picture = np.empty((*seen.shape, 3))
-    picture[:] = to_rgb(GROUND)
-    picture[(one & two).any(axis=0)] = to_rgb(AGREE)
-    picture[(two & ~one).any(axis=0)] = to_rgb(ONLY_MAPPED)
-    picture[(one & ~two).any(axis=0)] = to_rgb(ONLY_SEEN)
-    picture[~known.any(axis=0)] = to_rgb(HIDDEN)
+    picture[:] = rgb_of(GROUND)
+    picture[(one & two).any(axis=0)] = rgb_of(AGREE)
+    picture[(two & ~one).any(axis=0)] = rgb_of(ONLY_MAPPED)
+    picture[(one & ~two).any(axis=0)] = rgb_of(ONLY_SEEN)
+    picture[~known.any(axis=0)] = rgb_of(HIDDEN)
     return picture
+
+
+def is_one_of_several(seen: Evidence) -> NDArray[np.bool_]:
+    """Return where a class is as likely as not, as another one is: shape (C, rows, cols).
+
+    A legend of masks says so of a value that stands for two classes.
+    """
+    if seen.confidence is None:
+        return np.zeros(seen.cells.shape, dtype=bool)
+    found = (seen.cells == PRESENT) & (seen.confidence <= _EVEN)
+    return np.asarray(found & (found.sum(axis=0) > 1), dtype=bool)
+
+
+def settled(seen: Evidence, mapped: Evidence) -> Evidence:
+    """Return a view in which one of several classes is the one that the map shows, where it shows one of them.
+
+    >>> cells = np.ones((2, 1, 2), dtype=np.uint8)
+    >>> roads = ("road_major", "road_minor")
+    >>> seen = Evidence(classes=roads, cells=cells, cell_size_m=1.0, confidence=np.zeros_like(cells))
+    >>> mapped = Evidence(classes=roads, cells=np.array([[[0, 0]], [[1, 0]]], dtype=np.uint8), cell_size_m=1.0)
+    >>> settled(seen, mapped).cells.tolist()
+    [[[0, 1]], [[1, 1]]]
+    """
+    several = is_one_of_several(seen)
+    there = mapped.cells == PRESENT
+    lost = several & ~there & (several & there).any(axis=0)
+    return seen.replace(np.where(lost, ABSENT, seen.cells).astype(np.uint8), seen.confidence)
 
 
 def write_sheet(path: Path, *, title: str, panels: Sequence[Panel], credit: str = ATTRIBUTION) -> None:
@@ -98,6 +138,8 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI, credit
     figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
     legend = "view against map   pink: only seen   blue: only mapped   light grey: both   white: none   grey: unknown"
+    if any(is_one_of_several(panel.query.evidence).any() for panel in panels):
+        legend += "   one of two classes: in the colour of one, both if either is mapped"
     figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=9.5, color="#444444")
     _draw_legend(figure, width, height, {name for panel in panels for name in panel.query.evidence.classes})
     for at, panel in enumerate(panels):
@@ -143,9 +185,9 @@ def _photo(query: Query) -> NDArray[np.float64] | None:
 def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:
     seen, mapped, decoy = panel.query.evidence, panel.at_truth, panel.at_decoy
     return (
-        paint_evidence(seen),
+        paint_evidence(seen.of_known_classes()),
         None if mapped is None else paint_evidence(mapped),
-        None if mapped is None else paint_difference(seen, mapped),
+        None if mapped is None else paint_difference(settled(seen, mapped), mapped),
         None if decoy is None else paint_evidence(decoy),
     )
 
@@ -168,6 +210,8 @@ def _draw_vectors(chart: Axes, query: Query) -> None:
 def strength_text(truth: Truth) -> str:
     """Return the strength of a query; for an older map its true age, since its date is only the nearest to the step.
 
+    Of a user's own picture it is how well its place is known.
+
     Examples
     --------
     >>> from types import SimpleNamespace
@@ -175,9 +219,24 @@ def strength_text(truth: Truth) -> str:
     'map 3.6 years old (step 5)'
     """
     age_years = truth.measured.get("age_years")
+    if truth.strength_unit == TRUTH_SIGMA:
+        return f"place known to {truth.strength:g} m (standard deviation)"
     if age_years is None:
         return f"strength {truth.strength:g} ({truth.strength_unit})"
     return f"map {age_years:.1f} years old (step {truth.strength:g})"
+
+
+def flight_title(truth: Truth) -> str:
+    """Return what a flight is, with the odometer that drifts on it where its kind names one by its profile.
+
+    >>> from types import SimpleNamespace
+    >>> flight_title(SimpleNamespace(title="stress: F1 vio-stereo"))
+    'stress: F1 vio-stereo (its odometer: Visual-inertial odometry, stereo)'
+    """
+    profile = truth.title.rpartition(" ")[2]
+    if profile not in list_profiles():
+        return truth.title
+    return f"{truth.title} (its odometer: {load_profile(profile).title})"
 
 
 def rival_text(truth: Truth) -> str:
@@ -210,13 +269,20 @@ def _known_text(query: Query) -> str:
     return f"{PriorGroup.parse(query.prior_group).words}; {len(query.candidates)} candidates{vectors}"
 
 
+def _value(name: str, value: float) -> str:
+    if name == UTC:
+        return f"{dt.datetime.fromtimestamp(value, tz=dt.UTC):%Y-%m-%d %H:%M:%S}"
+    return f"{value:.3g}"
+
+
 def _text(panel: Panel) -> tuple[str, ...]:
     query, truth = panel.query, panel.truth
     rows, cols = query.evidence.shape
     alias = "" if truth.alias_index is None else f", alias {truth.alias_index:.2f}"
-    measured = ", ".join(f"{name} {value:.3g}" for name, value in truth.measured.items() if name not in _OF_TWIN)
+    shown = {name: value for name, value in truth.measured.items() if name not in _OF_TWIN}
+    measured = ", ".join(f"{name} {_value(name, value)}" for name, value in shown.items())
     return (
-        f"{truth.role}: {truth.kind}" + (f", detector {truth.detector}" if truth.detector != PUBLISHED else ""),
+        truth.title + (f", detector {truth.detector}" if truth.detector != PUBLISHED else ""),
         strength_text(truth),
         f"{query.track}, {rows} x {cols} cells of {query.evidence.cell_size_m:g} m",
         _known_text(query),
@@ -632,7 +698,7 @@ def _words(panel: FlightPanel) -> tuple[str, ...]:
     facts += [f"carried {truth.measured['carried_m']:.0f} m"] if "carried_m" in truth.measured else []
     off_m = float(np.hypot(*(panel.reckoned_m[-1] - panel.place_m[-1])))
     return (
-        f"{truth.role}: {truth.kind}{step if truth.role == 'stress' else ''}"
+        f"{truth.title}{step if truth.role == 'stress' else ''}"
         + (f", detector {truth.detector}" if truth.detector != PUBLISHED else ""),
         ", ".join(facts),
         f"odometer alone ends {off_m:.0f} m off",

@@ -2,6 +2,7 @@
 """Tasks on disk: `queries.parquet` and `task.json` for everyone, `truth.parquet` for the scorer alone."""
 
 import datetime as dt
+import difflib
 import hashlib
 import json
 from collections import Counter
@@ -29,7 +30,7 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, Evidence, pack, unpack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest, Provenance
 from sasgeo_bench.regions.region_files import read_manifest
-from sasgeo_bench.tasks.frames import FRAME, LABEL_SCHEMA, LABELS, frame_of, frame_row, label_row
+from sasgeo_bench.tasks.frame_files import FRAME, LABEL_SCHEMA, LABELS, frame_of, frame_row, label_row
 from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, TASK_VERSIONS, Head, Query, Step, Truth
 
 if TYPE_CHECKING:
@@ -409,6 +410,7 @@ TRUTH_OF: Final = "truth.json"
 PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and bits, where the seed is private
 SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
+_MAKE: Final = "make the queries first (make-queries, import-flight; of your own pictures import-photos, import-masks)"
 _ROWS: Final = 128  # of a row group, which is in memory at once
 
 
@@ -459,6 +461,11 @@ class TaskOrigin(Document):
     def name(self) -> tuple[str, str]:
         """Suite and region, by which a task is known."""
         return self.suite, self.region
+
+    @property
+    def credit(self) -> str:
+        """Return whom to name beside what is made of the map: all that it was made of."""
+        return self.attribution or self.provenance.credit
 
     @property
     def map_hashes(self) -> dict[str, str]:
@@ -756,12 +763,10 @@ def write_task(
     frozen = hashlib.sha256()
     frames = 0
     labels: Any = None  # a writer, opened at the first picture
-    credit = origin.provenance.credit
+    terms = {"licence": origin.licence or LICENCE, "attribution": origin.credit}
     with ExitStack() as stack:
         queries, truths = (
-            stack.enter_context(
-                table_writer(path, schema.with_metadata(_META | {"attribution": credit}), compression_level=9)
-            )
+            stack.enter_context(table_writer(path, schema.with_metadata(_META | terms), compression_level=9))
             for path, schema in ((task_folder / QUERIES, FILE_SCHEMA), (truth_folder / TRUTH, TRUTH_SCHEMA))
         )
         for part in _batches(pairs):
@@ -785,14 +790,13 @@ def write_task(
     content = {
         "schema_version": SCHEMA_VERSION,
         "task_version": TASK_VERSION,
-        **origin.model_dump(mode="json", exclude_unset=True),
+        **origin.model_dump(mode="json", exclude_unset=True, exclude={*terms}),
         "counts": dict(counts),
         "prior_groups": sorted(groups),
         "candidates_sha256": frozen.hexdigest(),
         **({"frames": frames} if frames else {}),
         "files": {QUERIES: record.model_dump()},
-        "licence": LICENCE,
-        "attribution": credit,
+        **terms,
     }
     more = {} if hidden is None else hidden.model_dump(mode="json", exclude_unset=True, exclude={"queries_sha256"})
     _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **more})
@@ -825,12 +829,29 @@ def read_task(folder: str | Path) -> dict[str, JsonValue]:
     return Task.open(folder).manifest.to_json()
 
 
+def _no_task(folder: Path, named: str | Path) -> str:
+    """Return what is wrong with a folder that is no task, and the task that was meant, if one is near."""
+    if folder.is_dir():
+        inside = next(iter(sorted(folder.glob(f"*/{TASK}"))), None)
+        mend = f"{_MAKE}" if inside is None else f"name a task in it, as {inside.parent}, or all by a *"
+        return f"{named} holds no {TASK}: {mend}"
+    above = next(parent for parent in folder.parents if parent.is_dir())
+    tasks = {
+        "/".join(path.parts[-3:-1]): path.parent
+        for root in (above, Path("out", "tasks"))
+        for depth in ("*", "*/*")
+        for path in sorted(root.glob(f"{depth}/{TASK}"))
+    }
+    near = difflib.get_close_matches("/".join(folder.parts[-2:]), tasks, n=1, cutoff=0.8)
+    return f"there is no folder {named}: " + (
+        f"did you mean {tasks[near[0]]}?" if near else f"{_MAKE}, or check the path"
+    )
+
+
 def _read_manifest(folder: Path, *, named: str | Path) -> TaskManifest:
     path = folder / TASK
     if not path.is_file():
-        inside = next(iter(sorted(folder.glob(f"*/{TASK}"))), None)
-        mend = "make the queries first" if inside is None else f"name a task in it, as {inside.parent}, or all by a *"
-        raise StoreError(f"{named} holds no {TASK}: {mend}")
+        raise StoreError(_no_task(folder, named))
     content = read_json(path, mend=_MEND)
     about = content if isinstance(content, dict) else {}
     for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):

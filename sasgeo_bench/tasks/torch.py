@@ -22,7 +22,8 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, LayerBits, observe
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sensing.image import LabelledImage
-from sasgeo_bench.tasks.frames import Frame, FrameLabels, read_labels
+from sasgeo_bench.tasks.frame_files import read_labels
+from sasgeo_bench.tasks.frames import Frame, FrameLabels
 from sasgeo_bench.tasks.query import Query, Track, Truth, base_of
 from sasgeo_bench.tasks.task_files import QUERIES, QUERY_SCHEMA, Task, query_of, read_batches
 

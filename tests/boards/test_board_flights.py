@@ -17,7 +17,7 @@ from sasgeo_bench.boards.board_files import read_leaderboard, read_scores
 from sasgeo_bench.boards.board_pictures import FLIGHT_BYTES
 from sasgeo_bench.boards.flight_page import ellipse_of, flight_page
 from sasgeo_bench.boards.publish import publish
-from sasgeo_bench.cli.boards import score
+from sasgeo_bench.cli.boards import score, show_board
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import RunManifest
@@ -144,7 +144,7 @@ ASKED = {
 
 
 @pytest.mark.usefixtures("plain_site")
-def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results_scored_again(out, tmp_path):
+def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results_scored_again(out, tmp_path, capsys):
     results = tmp_path / "results"
     board = score(predictions=out / "runs", out=out, name="asked", draws=100, cases=False, results=results, **ASKED)
     mine = board.leaderboard[board.leaderboard["metric"] == "distance_within_5m_1deg"]
@@ -176,6 +176,15 @@ def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results
     assert sum(f"of {100 * confirmed:.3g} % confirmed" in cell for cell in shares) == 1
     assert sum(" % accepted" in cell for cell in shares) == 1
     assert "## Fixes in use: flight-overconfident" in text
+    head = next(line for line in text.splitlines() if line.startswith("| matcher | distance_within_25m"))
+    assert {"distance_within_5m_1deg", "distance_within_50m", "available_30s"} <= set(head.split(" | "))
+    capsys.readouterr()
+    show_board(board)
+    shown = capsys.readouterr().out.splitlines()
+    head = next(line for line in shown if SUITE in line and "matcher" in line)
+    assert any(line.startswith("flights under stress  2 ") for line in shown)  # of six
+    assert {"distance_within_5m_1deg", "distance_within_50m", "available_30s"} <= set(head.split())
+    assert "| error_p95 (m) | first_fix (m) |" in text
 
 
 @pytest.mark.parametrize(
@@ -294,13 +303,17 @@ def test_the_receiver_is_checked_by_the_fixes_of_a_run(out, program, mistake):
     code, printed, err = program("check-gnss", str(out / "runs" / "near"), "--out", str(out), "--pull-off", "2,20")
     assert code == 0, err
     rows = [line.split() for line in printed.splitlines()[1:] if line.strip()]
-    assert [row[:3] for row in rows] == [[SUITE, REGION, "6"]] * 2
-    assert [row[5] for row in rows] == ["0.00"] * 2  # false alarms: its fixes are 3 m off
-    assert float(rows[0][6]) == pytest.approx(2.996 / float(rows[0][3]), rel=0.05)  # the rule of three
-    assert rows[1][8] == "100%"
+    assert [row[:4] for row in rows] == [[SUITE, REGION, "6", "2"]] * 2
+    scores = read_scores(out / "boards" / "mine")
+    hours = scores.groupby("pair_id")["duration_s"].first().sum() / 3600
+    assert float(rows[0][4]) == pytest.approx(hours, rel=0.05)  # three flights along one path are one
+    assert "one path count as one" in err
+    assert [row[6] for row in rows] == ["0.00"] * 2  # false alarms: its fixes are 3 m off
+    assert float(rows[0][7]) == pytest.approx(2.996 / hours, rel=0.01)  # the rule of three
+    assert rows[1][9] == "100%"
     # fixes that are accepted 40 m off alarm every flight
     printed = program("check-gnss", str(out / "runs" / "far"), "--out", str(out))[1]
-    assert float(printed.splitlines()[1].split()[5]) > 0
+    assert float(printed.splitlines()[1].split()[6]) > 0
     assert "--pull-off must be positive metres a second" in mistake(
         "check-gnss", out / "runs" / "near", "--pull-off", "0"
     )

@@ -325,7 +325,7 @@ def test_inspect_names_what_is_wrong_with_a_run_in_one_line(root, program, tmp_p
     shutil.rmtree(out / "truth" / "alias")
     assert "holds no truths of" in fault(mine, "--query", query)
     shutil.rmtree(out / "tasks" / "alias")
-    assert "holds no task.json: make the queries first" in fault(mine)
+    assert "there is no folder" in fault(mine)
     (out / "regions").unlink()
     there = task_files.Task.open(out / "tasks" / "absent" / "town-riverside").ids()[0]
     assert "holds no region.json: build the region first" in fault(out / "runs" / "mine" / HASH, "--query", there)

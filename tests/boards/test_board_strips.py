@@ -101,7 +101,11 @@ def test_a_board_on_pictures_has_a_strip_of_the_matcher_that_finds_most(board):
 @pytest.mark.parametrize("is_of_flights", [False, True])
 def test_flights_of_pictures_have_maps_instead_of_a_strip(is_of_flights, monkeypatch):
     rows = {"query_id": ["00ff"], "suite": "flight-image+good", "region": REGION, "role": "control", "detector": "real"}
-    scores = {"tracker": pd.DataFrame(rows | {"is_present": True, "is_right": True, "yaw_error_deg": 0.0})}
+    scores = {
+        "tracker": pd.DataFrame(
+            rows | {"is_present": True, "is_right": True, "yaw_error_deg": 0.0, "strength_unit": "m"}
+        )
+    }
     task = SimpleNamespace(manifest=SimpleNamespace(frames=3, is_of_flights=is_of_flights))
     drawn = []
     monkeypatch.setattr(board_pictures, "_cases", lambda chosen, *_: drawn.extend(chosen) or iter(()))

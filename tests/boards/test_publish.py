@@ -357,11 +357,29 @@ def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path)
     lines = []
     with reporting(lines.append):
         pages = read(publish(tmp_path / "mine").folder)
-    assert lines == ["not on the map of places, for no region of that name ships: my-town"]
+    assert lines == ["not on the map of places, for no region of that name ships or is built in out: my-town"]
     assert "This version knows no suite of that name" in " ".join(pages["suite-nobodys-suite.html"].said("p"))
     assert "nobodys-suite: localization, my-group" in pages["index.html"].said("h3")
     assert "It has no figure on this board." in pages["matcher-unasked.html"].said("p")
     assert pages["index.html"].said("h1") == ["mine: A title of mine"]
+
+
+@pytest.mark.usefixtures("plain_site")
+def test_a_region_of_ones_own_is_on_the_map_with_its_scenes_where_it_is_built(tmp_path, towns):
+    built = tmp_path / "out" / "regions" / "my-place"
+    built.mkdir(parents=True)
+    shutil.copy(towns / "regions" / "town-riverside" / "region.json", built)
+    scenes = json.loads((built / "region.json").read_text(encoding="utf-8"))["scenes"]
+    tasks = [{"suite": "photos", "region": "my-place"}]
+    put_board(tmp_path / "mine", table=many_rows(2).assign(suite="photos"), tasks=tasks, entries=[entry_of("unasked")])
+    lines = []
+    with reporting(lines.append):
+        site = publish(tmp_path / "mine", root=tmp_path / "out").folder
+    assert lines == []
+    text = (site / "regions.html").read_text(encoding="utf-8")
+    assert "is not known" not in text
+    assert ", ".join(scenes) in text
+    assert "made from them. Code: Apache-2.0." in text
 
 
 # Bad input

@@ -3,6 +3,7 @@
 
 import gzip
 import json
+import re
 import shutil
 import threading
 import time
@@ -311,6 +312,21 @@ def test_the_map_turns_through_the_queries_and_the_address_keeps_which(page, sit
     assert "Answernone" in facts
     assert "the right answer is none" in facts
     assert page.faults == []
+
+
+def test_the_map_begins_with_all_queries_where_none_failed(page, site, tmp_path):
+    page.open(address(site, "map.html") + "?matcher=graph")
+    until(page, f"{TOLD}.endsWith('queries')")
+    assert page.value("document.getElementById('choice').elements.outcome.value") == "failures"
+    copied = shutil.copytree(site, tmp_path / "copy")
+    script = copied / "maps" / "vaduz-0.js"
+    held = script.read_text(encoding="utf-8")
+    script.write_text(re.sub(r"\[(\d+), ?-?\d+", r"[\1,0", held), encoding="utf-8")  # all as it should be
+    page.open(address(copied, "map.html") + "?matcher=graph")
+    until(page, f"{TOLD}.endsWith('queries')")
+    assert page.value("document.getElementById('choice').elements.outcome.value") == ""
+    page.open(address(copied, "map.html") + "?matcher=graph&outcome=failures")  # unless these are asked for
+    until(page, f"{TOLD} === 'no such query here'")
 
 
 def test_a_map_that_is_lost_is_told(page, site, tmp_path):

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.axes import Axes
 
 from sasgeo_bench.boards import strip_plot
 from sasgeo_bench.boards.cases import CasePicture, MapPart
@@ -13,6 +14,7 @@ from sasgeo_bench.boards.strip_plot import Strip, best_on_pictures, pictured_tas
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.tasks.query import TRUTH_SIGMA
 from sasgeo_bench.tasks.segmented import NOTHING, Segmented
 
 PLACE = Pose(easting_m=50.0, northing_m=50.0, yaw_deg=30.0)
@@ -45,7 +47,7 @@ def cases(rights, suites=None):
     rows = pd.DataFrame({"is_right": rights})
     names = suites or ["aerial+good"] * len(rights)
     rows = rows.assign(query_id=[f"q{at:02}" for at in range(len(rows))], region="town", suite=names, role="stress")
-    rows = rows.assign(yaw_error_deg=0.0, detector="rendered")
+    rows = rows.assign(yaw_error_deg=0.0, detector="rendered", strength_unit="m")
     tasks = {
         (name, "town"): SimpleNamespace(
             manifest=SimpleNamespace(frames=3 if "+" in name else None, is_of_flights=False)
@@ -88,6 +90,28 @@ def test_a_place_with_a_wrong_heading_is_a_failure():
     assert Strip.of(scores, {("aerial+good", "town")}, 2).query_ids == ("q00", "q01")
     turned = [Pose(easting_m=50.0, northing_m=50.0, yaw_deg=30.0 - by_deg) for by_deg in (4.0, 6.0)]
     assert [case(answer).is_found for answer in turned] == [True, False]
+
+
+def test_an_own_picture_whose_file_states_another_heading_is_no_fault_of_the_matcher(monkeypatch):
+    scores = cases([True, True, False]).scores.assign(yaw_error_deg=[4.0, 6.0, 6.0], role="control")
+    assert "the place" not in Strip.of(scores, {("aerial+good", "town")}, 3).facts
+    own = Strip.of(scores.assign(strength_unit=TRUTH_SIGMA), {("aerial+good", "town")}, 3)
+    assert "in 1 of 3 queries (in 1 more the place, with another heading than the file states);" in own.facts
+    assert "stress" not in own.facts
+    said = []
+    monkeypatch.setattr(Axes, "set_xlabel", lambda _, text, **words: said.append((text, words.get("color"))))
+    far = Pose(easting_m=80.0, northing_m=90.0, yaw_deg=30.0)
+    turned = Pose(easting_m=50.0, northing_m=52.0, yaw_deg=36.0)
+    rows = [case(turned), case(turned, is_own=True), case(far, is_own=True), case(is_own=True)]
+    strip_pixels(own, rows, title="mine")
+    verdicts = [one for one in said if "off" in one[0]]
+    assert [text for text, _ in verdicts] == [
+        "MISSED: 2 m and 6 deg off",
+        "PLACE FOUND: 2 m and 6 deg off",
+        "MISSED: 50 m and 0 deg off",
+        "FOUND: 0 m and 0 deg off",
+    ]
+    assert len({colour for _, colour in verdicts}) == 3
 
 
 def test_the_strip_of_a_board_is_of_the_matcher_that_finds_most_and_never_of_a_control():

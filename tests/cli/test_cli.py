@@ -79,7 +79,7 @@ def test_several_values_of_an_option_are_those_that_a_shell_makes_of_a_pattern(w
 
 
 def test_a_run_and_segmentations_take_several_tasks(mistake, monkeypatch):
-    assert "a holds no task.json" in mistake("run", "--matcher", "random", "--tasks", "a", "b")
+    assert "there is no folder a: make the queries first" in mistake("run", "--matcher", "random", "--tasks", "a", "b")
 
     def split(name, *, folders):
         raise ConfigError(f"asked for {name} of {folders}")

@@ -253,13 +253,20 @@ def test_a_target_that_is_nothing_gets_one_line(command, target, words, mistake)
         ("out/boards/mine", "out/boards/mine is a board: publish --board out/boards/mine makes a site of it"),
         (f"out/tasks/{CLEAN}/task.json", f"is a file, not a region, task or run: name its folder out/tasks/{CLEAN}"),
         ("clean/town-riversied", f"holds no task clean/town-riversied: there is {CLEAN}"),
+        ("town-grid.toml", "town-grid.toml is a region file: inspect town-grid shows it"),
+        ("mine.toml", "mine.toml is a region file: build-region mine.toml first, then inspect mine"),
+        ("out/locate/a", "out/locate/a is what locate found: open out/locate/a/index.html in a browser"),
+        ("out/locate/a/index.html", "out/locate/a/index.html is a page: open it in a browser"),
     ],
 )
 def test_a_target_that_is_something_else_is_told_what_it_is_and_what_there_is(target, words, mistake, tmp_path):
     files = [f"regions/{RIVERSIDE}/region.json", "regions/town-grid/region.json", f"tasks/{CLEAN}/task.json"]
-    for path in (tmp_path / "out" / file for file in (*files, "boards/mine/board.json")):
-        path.parent.mkdir(parents=True)
+    others = ("boards/mine/board.json", "locate/a/locate.csv", "locate/a/index.html")
+    for path in (tmp_path / "out" / file for file in (*files, *others)):
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
+    for name in ("mine.toml", "town-grid.toml"):
+        (tmp_path / name).write_text('id = "mine"\n[[extract]]\nfile = "a.osm.pbf"\n')
     assert words in mistake("inspect", target)
 
 

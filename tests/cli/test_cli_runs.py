@@ -208,14 +208,14 @@ def test_a_run_says_what_is_left_is_cut_off_goes_on_and_is_validated_and_merged(
     assert f"{len(ids)} queries left, 0 done" in printed
     assert not (out / "runs").exists()
     code, printed, err = program(*GOOD, "--limit", "2")
-    assert (code, err) == (0, "good 1: 2 ok\n")
+    assert (code, err) == (0, "good, version 1: 2 ok\n")
     folder = Path(printed.strip())
     assert folder.parts[:3] == ("out", "runs", "good")
     code, printed, err = program("validate", "--predictions", folder, "--tasks", TASK)
     assert (code, err) == (2, f"{folder}: {len(ids) - 2} violations\n")
     assert all(line.endswith("expected one for every query") for line in printed.splitlines())
     code, printed, err = program(*GOOD, "--jobs", "2")
-    assert (code, printed, err) == (0, f"{folder}\n", f"good 1: {len(ids) - 2} ok\n")
+    assert (code, printed, err) == (0, f"{folder}\n", f"good, version 1: {len(ids) - 2} ok\n")
     code, printed, err = program("validate", "--predictions", folder, "--tasks", TASK)
     assert (code, printed, err) == (0, f"{folder}: answers every query of 1 task, and nothing else\n", "")
     code, printed, err = program("merge", "--runs", folder, "--into", "all.parquet")
@@ -302,6 +302,7 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
     [
         (("--shard", "0/2"), "--shard must be i/n with 1 <= i <= n, got 0/2"),
         (("--limit", "-1"), "--limit must be at least 1, got -1"),
+        (("--match-s", "30s"), "'--match-s': give the number alone, no unit"),
         (("--match-s", "nan"), "--match-s must be seconds between 0 and 604800, got nan"),
         (("--memory-mb", "1"), "--memory-mb must lie between 64 and 4000000, got 1"),
         (("--scratch-mb", "0"), "--scratch-mb must lie between 1 and 4000000, got 0"),
@@ -310,7 +311,8 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
             "--again must be one of ok, timeout, crash, invalid, refused, not applicable, got 'late'",
         ),
         (("--most-trained", "0"), "--most-trained must lie between 1 and 2000, got 0"),
-        (("--tasks", "nowhere"), "nowhere holds no task.json: make the queries first"),
+        (("--tasks", "nowhere"), "there is no folder nowhere: make the queries first (make-queries, "),
+        (("--tasks", f"{TASK}x"), f"there is no folder {TASK}x: did you mean {TASK}?"),
         (("--tasks", str(Path(TASK).parent)), f"holds no task.json: name a task in it, as {TASK}, or all by a *"),
         (("--out", "a-file"), "cannot be written (Not a directory)"),
     ],
@@ -445,7 +447,7 @@ def test_the_runs_of_two_matchers_are_not_validated_as_one(mistake, run_folder) 
 def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:
     path = mine()
     words = ("validate", "--predictions")
-    assert "nowhere holds no task.json: make the queries first" in mistake(*words, path, "--tasks", "nowhere")
+    assert "there is no folder nowhere: make the queries first" in mistake(*words, path, "--tasks", "nowhere")
     for more in ((), ("--tasks", TASK)):  # what is wrong with the answers is told first
         assert "there is no region, task, split or run 'nowhere'" in mistake(*words, "nowhere", *more)
     assert "mine.parquet holds answers: name --tasks, task folders or the stored results" in mistake(*words, path)

@@ -10,7 +10,7 @@ import pytest
 from sasgeo_bench.core import plugins
 from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.core.plugins import MATCHERS, digest_of, ships
-from sasgeo_bench.running.plan import SEGMENTER_TOOLS, TOOLS, matcher_code, segmenter_code
+from sasgeo_bench.running.plugin_code import SEGMENTER_TOOLS, TOOLS, matcher_code, segmenter_code
 
 MODULE = '''
 """What it is."""

@@ -48,7 +48,8 @@ from sasgeo_bench.running.plan import RunRequest, reach_of
 from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
-from sasgeo_bench.tasks.frames import FRAME, Frame, frame_row
+from sasgeo_bench.tasks.frame_files import FRAME, frame_row
+from sasgeo_bench.tasks.frames import Frame
 from tests.regions.imagery_place import write_picture
 
 GRID, RIVERSIDE = "town-grid", "town-riverside"

@@ -110,6 +110,10 @@ def test_a_log_without_fixes_heights_or_attitudes_says_so(tmp_path: Path) -> Non
         read_log(write(tmp_path / "b.bin", dataflash({"GPS": blind})))
     with pytest.raises(FlightError, match=r"c\.bin: no place: no message of GPS"):
         read_log(write(tmp_path / "c.bin", dataflash({"ATT": rows["ATT"]})))
+    with pytest.raises(FlightError, match=r"d\.bin: a ULog by its first bytes, no DataFlash: rename it to \.ulg"):
+        read_log(write(tmp_path / "d.bin", b"ULog\x01\x12\x35\x01" + bytes(80)))
+    with pytest.raises(FlightError, match=r"e\.bin: no DataFlash by its first bytes"):
+        read_log(write(tmp_path / "e.bin", bytes(range(80))))
 
 
 @pytest.mark.filterwarnings("ignore:a.bin. left out 1 point without a value of")  # the last, before its attitude

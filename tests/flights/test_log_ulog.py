@@ -199,6 +199,10 @@ def test_a_flight_that_never_leaves_the_ground_is_told(tmp_path: Path) -> None:
         (b"ULog\x01\x12\x35\x01" + bytes(8), "no place: no message of vehicle_gps_position, sensor_gps or vehicle_gl"),
         (b"PK" * 99, "cannot be read as such a log"),
         (ulog({RECEIVER: (autopilots.GPS_114, gps_rows(FLOWN, fix_type=2))}), "no place: 200 messages without a fix"),
+        (
+            ulog({RECEIVER: (autopilots.GPS_114, gps_rows(FLOWN, fix_type=2))})[:-5],
+            r"without a fix: .* \(cut off: the file",
+        ),
         (ulog({RECEIVER: (autopilots.GPS_114, gps_rows(FLOWN)[:1])}), "a flight needs two fixes of a receiver"),
         (ulog({RECEIVER: ("uint64_t timestamp;double lat;", [(1, 2.0), (2, 3.0)])}), "no field 'lon', so its vers"),
     ],

@@ -87,6 +87,8 @@ def checked(task: Task, values: np.ndarray, pose: sgb.Pose, *, off_m: float) -> 
         assert (seen == expected)[is_known].mean() > 0.98, name  # cells on an edge may go either way
     known = {name for name in view.classes if (view.layer(name) != sgb.UNKNOWN).any()}
     assert known == set(CODES)
+    hidden = np.mean([(view.layer(name) == sgb.UNKNOWN).mean() for name in CODES])  # other classes hide nothing
+    assert truth.unknown_share == pytest.approx(hidden)
     return query
 
 
@@ -213,6 +215,24 @@ def test_a_mask_of_another_shape_and_a_photo_without_one_are_left_out(own_out, r
     assert task.manifest.queries == 1
     assert any("c.jpg" in line and "without a mask" in line for line in lines)
     assert any("b.jpg" in line and "cut or turned" in line for line in lines)
+
+
+def test_masks_with_one_fault_are_one_line_with_their_names_in_order(own_out, region, pose, values, tmp_path):
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
+    photos.mkdir()
+    masks.mkdir()
+    for name, held in zip("dcba", (values, values[::-1], values.T, np.where(values == 3, 1, values)), strict=True):
+        photo_at(photos / f"{name}.jpg", region, pose)
+        Image.fromarray(held, mode="L").save(masks / f"{name}.png")
+    (tmp_path / "legend.toml").write_text('[values]\n9 = "building"\n')  # and the background is not named
+    lines = []
+    with pytest.raises(ConfigError, match=r"4 pictures \(a\.jpg, b\.jpg, c\.jpg, \.\.\.\) that cannot be decoded"):
+        sgb.import_masks(
+            masks, photos=photos, legend=tmp_path / "legend.toml", region=TOWN, out=own_out, tell=lines.append
+        )
+    (line,) = (line for line in lines if "left out" in line)
+    assert "a.jpg, b.jpg, c.jpg" in line
+    assert 'it holds is not in the legend, such as 0: if that is the background, say 0 = "none"' in line
 
 
 def test_masks_of_another_legend_are_one_line_however_many(own_out, region, pose, values, legend, tmp_path):

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Own pictures as tasks: truths, priors, flights, heights over a slope, and pictures that are left out."""
 
+import json
 import math
+import shutil
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import rasterio
 from PIL import ExifTags, Image
@@ -22,10 +25,11 @@ from sasgeo_bench.observing.photo_flights import flights_of
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.pictures import OwnPicture
 from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights, PosedPicture
+from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.sensing.crops import drawn_crops
 from sasgeo_bench.tasks.query import TRUTH_SIGMA, PriorGroup
-from sasgeo_bench.tasks.task_files import Task
+from sasgeo_bench.tasks.task_files import QUERIES, TRUTH, Task
 from tests import pose_files
 from tests.sensing import test_visual_odometry as plane
 from tests.sensing.test_photos import write_photo, xmp_of
@@ -424,6 +428,8 @@ def test_a_georeferenced_picture_needs_no_table(towns, region, middle, tmp_path)
     assert (truth.pose.easting_m, truth.pose.northing_m) == pytest.approx(middle, abs=0.01)
     assert abs((truth.pose.yaw_deg + 180) % 360 - 180) < 0.01
     assert truth.measured["truth_sigma_m"] == 0.5
+    _, lines = quiet(replace(request, heights=Heights(height_m=80.0)))
+    assert "heights are passed over of 1 georeferenced picture: each tells its size" in lines
 
 
 def exif_of(region, place):
@@ -742,3 +748,27 @@ def test_a_segmenter_that_need_not_learn_sees_pictures_of_a_task_without_a_split
     assert query.evidence.unknown_share < 1.0
     with pytest.raises(ConfigError, match="unet needs training, and these tasks have no split: name one with --split"):
         segment_tasks(replace(wanted, spec="unet"))
+
+
+def test_pictures_that_replace_others_of_their_name_say_so(laid, region, middle):
+    rows = [row(region, f"{at}.png", offset(middle, 30 * at, 0)) for at in range(2)]
+    assert not [line for line in quiet(laid(rows))[1] if "replaced" in line]
+    assert not [line for line in quiet(laid(rows))[1] if "replaced" in line]  # the same again
+    (told,) = (line for line in quiet(laid(rows[:1]))[1] if "replaced" in line)
+    assert told.endswith(
+        f"photos/{TOWN} held the queries of another import, which are replaced (another --name keeps both)"
+    )
+
+
+def test_a_task_credits_what_its_map_was_made_of_and_no_other(laid, region, middle, towns, tmp_path):
+    own = tmp_path / "regions" / TOWN
+    shutil.copytree(towns / "regions" / TOWN, own)
+    manifest = json.loads((own / "region.json").read_text())
+    terms = {"attribution": "building: a land survey (CC0-1.0)", "licence": "CC0-1.0"}
+    (own / "region.json").write_text(json.dumps(manifest | terms))
+    request = laid([row(region, "a.png", middle)])
+    for folder, said in ((request.region, ATTRIBUTION), (own, terms["attribution"])):
+        (task,), _ = quiet(replace(request, region=folder))
+        assert (task.manifest.attribution, task.manifest.licence == "CC0-1.0") == (said, folder == own)
+        for file in (task.folder / QUERIES, task.truth / TRUTH):
+            assert pq.read_schema(file).metadata[b"attribution"].decode() == said

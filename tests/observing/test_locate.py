@@ -141,6 +141,19 @@ def test_one_picture_that_is_none_costs_its_own_row(located):
     assert (rows[0]["is_accepted"], rows[1]["is_accepted"]) == ("true", "false")
 
 
+def test_where_every_picture_fails_results_of_an_earlier_call_stay(located, towns, tmp_path):
+    into, _ = located
+    before = {name: (into / name).read_bytes() for name in ("locate.csv", "index.html")}
+    (tmp_path / "b.jpg").write_text("no picture")
+    lines = []
+    words = {"ground_width": 100.0, "region": TOWN, "trusted": True, "tell": lines.append}
+    sgb.locate(tmp_path, out=towns, into=into, **words)
+    assert {name: (into / name).read_bytes() for name in before} == before
+    assert f"no picture could be asked: {into} keeps the results of an earlier call" in lines
+    sgb.locate(tmp_path, out=towns, into=tmp_path / "into", **words)  # with none, the table says what is wrong
+    assert "no JPEG, TIFF or DNG" in (tmp_path / "into" / "locate.csv").read_text()
+
+
 def test_the_page_shows_every_picture_and_what_the_chances_stand_on(located):
     into, _ = located
     page = (into / "index.html").read_text()
@@ -317,6 +330,7 @@ def test_an_answer_is_kept_for_its_own_words_alone(towns, pictures):
         {"heading": (10.0, 5.0)},
         {"is_turned": True},
         {"told": Told(height_m=50.0)},
+        {"told": Told(dem=pictures / "a.tif")},
         {"uses_position": False},
         {"most_false": 0.1},
     )
@@ -328,10 +342,12 @@ def test_an_answer_is_kept_for_its_own_words_alone(towns, pictures):
 def test_an_answer_says_why_it_is_withheld():
     prior = sgb.Prior(center_m=(0.0, 0.0), radius_m=500.0, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
     answer = Prediction(query_id="q", diagnostics={"modes_above": 3.0})
-    assert verdict(answer, 0.05, prior, 0.05) == ("found", "")
-    assert verdict(answer, 0.3, prior, 0.05) == ("withheld", "2 other places within 500 m look alike")
-    assert verdict(answer, 0.9, prior, 0.05)[0] == "not on this map"
-    assert verdict(answer, None, prior, 0.05)[0] == "withheld"
+    how = {"side_m": 156.9, "most_false": 0.05}
+    assert verdict(answer, 0.05, prior, **how) == ("found", "")
+    assert verdict(answer, 0.3, prior, **how) == ("withheld", "2 other places within 500 m look alike")
+    nowhere = ("not on this map", "no place within 500 m explains what is seen, taken as 157 m wide")
+    assert verdict(answer, 0.9, prior, **how) == nowhere
+    assert verdict(answer, None, prior, **how)[0] == "withheld"
 
 
 FIXES = (

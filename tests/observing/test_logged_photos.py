@@ -10,7 +10,7 @@ from PIL import ExifTags, Image
 from sasgeo_bench.core.errors import ConfigError, FlightError, PoseError
 from sasgeo_bench.observing.import_photos import ImportRequest
 from sasgeo_bench.observing.logged_photos import poses_by_log
-from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M
+from sasgeo_bench.observing.posed_pictures import GPS_SIGMA_M, Heights, pose_pictures
 from tests.sensing.test_photos import write_photo, xmp_of
 
 LON, LAT, STEP = 9.5200013, 47.1400017, 1e-4  # of as many digits as a receiver has
@@ -105,6 +105,31 @@ def test_photos_that_the_log_does_not_tell_are_left_out_with_the_reason(tmp_path
         poses_by_log(log, {"early": found["early"]})
     with pytest.raises(PoseError, match=r"\(1 photo \(timeless\) without a time \(EXIF's DateTimeOriginal\)\)$"):
         poses_by_log(log, {"timeless": found["timeless"]})
+
+
+def test_a_photo_outside_the_log_is_told_once(tmp_path):
+    folder, log = tmp_path / "photos", log_of(tmp_path / "log.csv")
+    folder.mkdir()
+    times = {"good.jpg": "2025:05:01 12:00:05", "early.jpg": "2025:05:01 11:59:00"}
+    table = poses_by_log(log, {name: photo(folder / name, time) for name, time in times.items()})
+    found = pose_pictures(folder, table, epsg=32632, heights=Heights())
+    assert found.left_out["that the track does not cover"] == ["early.jpg"]
+    assert sum("early.jpg" in names for names in found.left_out.values()) == 1
+    assert not [line for line in table.lines() if "early" in line]
+
+
+def test_a_log_without_headings_asks_for_one_that_has_them_not_for_a_column(tmp_path):
+    folder, log = tmp_path / "photos", tmp_path / "flight.gpx"
+    folder.mkdir()
+    points = (f'<trkpt lat="{LAT + at * STEP}" lon="{LON}"><ele>{300 + at}</ele><time>2025-05-01T10:00:{at:02d}Z</time>'
+              "</trkpt>" for at in range(40))  # fmt: skip
+    head = '<gpx version="1.1" creator="a" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>'
+    log.write_text(f"{head}{''.join(points)}</trkseg></trk></gpx>", encoding="utf-8")
+    table = poses_by_log(log, {"a.jpg": photo(folder / "a.jpg", "2025:05:01 12:00:05")})
+    (why,) = pose_pictures(folder, table, epsg=32632, heights=Heights()).left_out
+    assert why == (
+        "without angles of the camera (flight.gpx has no headings: name a log that has, or a table with gimbal_pitch)"
+    )
 
 
 def test_a_log_that_contradicts_the_photos_own_positions_is_told(tmp_path):

@@ -2,6 +2,7 @@
 """Masks of other people's networks: values as they are stored, whatever the file does to show them."""
 
 import json
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -14,7 +15,9 @@ from PIL import Image
 from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError, ImageError
 from sasgeo_bench.observing.masks import Legend, Strange, read_coco, read_legend, read_mask, run_lengths
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 
+ROOT = Path(__file__).parents[2]
 VALUES = '[values]\n0 = "none"\n1 = "building"\n2 = ["road_major", "road_minor"]\n3 = "unknown"'
 CELLS = np.array([[0, 1, 2, 3], [3, 2, 1, 0]], dtype=np.uint8)
 # planes of road_major, road_minor, building: the roads are one of two
@@ -254,6 +257,7 @@ def test_a_coco_file_with_a_fault_is_refused_on_one_line(tmp_path, content, hint
         ('[values]\n99999 = "water"', "0 to 65535"),
         ('[values]\n01 = "water"\n1 = "building"', "twice"),
         ('[bands]\n0 = "water"', "counted from 1"),
+        ('[bands]\n2 = ["road_major", "road_minor"]', "chances of one class, got several for '2'"),
         ('[bands]\n1 = "water"\n2 = "water"', "from two bands"),
     ],
 )
@@ -261,6 +265,12 @@ def test_a_legend_that_means_nothing_is_refused(tmp_path, text, hint):
     (tmp_path / "legend.toml").write_text(text)
     with pytest.raises(ConfigError, match=hint):
         read_legend(tmp_path / "legend.toml")
+
+
+def test_the_guide_lists_the_classes_that_a_legend_may_name():
+    guide = (ROOT / "docs" / "howto" / "own-photos.md").read_text(encoding="utf-8")
+    (listed,) = re.findall(r"The \[classes\]\(class\.md\) are ([^.]*)\.", guide)
+    assert tuple(re.findall(r"`(\w+)`", listed)) == load_taxonomy().names
 
 
 @pytest.mark.parametrize(
@@ -275,6 +285,7 @@ def test_a_legend_that_means_nothing_is_refused(tmp_path, text, hint):
         ("a.npy", lambda path: np.save(path, np.full((1, 2, 2), 3.0)), '[bands]\n1 = "water"', "sigmoid"),
         ("a.npy", lambda path: np.save(path, np.zeros((1, 2, 2))), '[bands]\n2 = "water"', "no band '2'"),
         ("a.npy", lambda path: np.save(path, np.zeros((2, 2))), '[bands]\n1 = "water"', "classes, rows, columns"),
+        ("a.npy", lambda path: np.save(path, np.zeros((4, 5, 3))), '[bands]\n1 = "water"', "transpose them"),
         ("a.tif", lambda path: write_tiff(path, np.zeros((3, 2, 2), np.uint8), photometric="RGB"), VALUES, "3 bands"),
         ("a.tif", lambda path: write_tiff(path, CELLS[None]), '[bands]\n1 = "water"', "look like values of classes"),
         ("a.tif", lambda path: write_tiff(path, CELLS[None]), '[colours]\n"#ff0000" = "water"', "8-bit red"),

@@ -13,7 +13,8 @@ from affine import Affine
 from PIL import ExifTags, Image
 from pyproj import Geod, Transformer
 
-from sasgeo_bench.core.errors import CameraError, ImageError
+import sasgeo_bench as sgb
+from sasgeo_bench.core.errors import CameraError, ConfigError, ImageError
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import to_grid
@@ -26,7 +27,8 @@ from sasgeo_bench.observing.pictures import (
     open_picture,
     see,
 )
-from sasgeo_bench.sensing.ground import Plane
+from sasgeo_bench.sensing.ground import Dem, Plane
+from tests.sensing.test_ground import write_dem
 from tests.sensing.test_photos import POSE, ZURICH, write_photo, xmp_of
 
 GEOD = Geod(ellps="WGS84")
@@ -66,7 +68,7 @@ def test_a_georeferenced_picture_says_its_middle_its_pixels_and_where_up_is(tmp_
     assert (found.heading_deg - azimuth_deg + 180) % 360 - 180 == pytest.approx(0, abs=0.02)
     assert (found.position_by, found.heading_by, found.note) == ("georeference", "georeference", "")
     told = open_picture(path, Told(height_m=80.0))
-    assert (told.gsd_m, told.note) == (found.gsd_m, "height and width passed over: its georeference tells")
+    assert (told.gsd_m, told.note) == (found.gsd_m, "--height passed over: its georeference tells its size")
 
 
 def test_a_picture_in_degrees_gets_square_pixels(tmp_path):
@@ -253,6 +255,34 @@ def test_a_position_of_another_datum_is_passed_over_and_said(tmp_path):
     assert found.lonlat is None
     assert found.heading_deg is not None
     assert "TOKYO" in found.note
+
+
+def test_a_photo_with_an_altitude_alone_is_as_high_as_that_is_above_the_ground(tmp_path):
+    """Ground at 420 m under one at 500 m; what a drone says above take-off counts where it says so."""
+    east_m, north_m = Transformer.from_crs(4326, 32632, always_xy=True).transform(8.5, 47.375)
+    grid = sgb.Grid.from_bounds(east_m - 999, north_m - 999, east_m + 999, north_m + 999, cell_size_m=20.0, epsg=32632)
+    dem = write_dem(tmp_path / "dem.tif", Dem(grid=grid, cells_m=np.full(grid.shape, 420.0, dtype=np.float32)))
+    facts = {name: value for name, value in POSE.items() if name != "RelativeAltitude"}
+    path = write_photo(tmp_path / "a.jpg", xmp=xmp_of(facts | {"AbsoluteAltitude": "+500.00"}))
+    found = open_picture(path, Told(dem=dem))
+    assert (found.height_m, found.note) == (pytest.approx(80.0), "height above the ground by dem.tif")
+    with pytest.raises(CameraError, match="how high the drone was"):
+        open_picture(path)
+    exif = ZURICH | {ExifTags.GPS.GPSAltitude: 505.0, ExifTags.GPS.GPSAltitudeRef: b"\x00"}
+    assert open_picture(write_photo(path, xmp=xmp_of(facts), gps=exif), Told(dem=dem)).height_m == pytest.approx(85.0)
+    write_photo(path, xmp=xmp_of(facts), gps=exif | {ExifTags.GPS.GPSAltitudeRef: b"\x02"})
+    with pytest.raises(CameraError, match="from the ellipsoid"):
+        open_picture(path, Told(dem=dem))
+    write_photo(path, xmp=xmp_of(facts | {"AbsoluteAltitude": "+500.00", "AltitudeType": "RtkAlt"}))
+    with pytest.raises(CameraError, match="from the ellipsoid"):
+        open_picture(path, Told(dem=dem))
+    with pytest.raises(CameraError, match="a photo without an altitude: say --height"):
+        open_picture(write_photo(path, xmp=xmp_of(facts)), Told(dem=dem))
+    with pytest.raises(ConfigError, match="cannot be read as a GeoTIFF of heights"):
+        open_picture(path, Told(dem=tmp_path / "none.tif"))
+    assert open_picture(write_photo(path), Told(dem=dem)).height_m == 50.0
+    with pytest.raises(ConfigError, match="told in one way"):
+        Told(dem=dem, height_m=80.0)
 
 
 def test_numbers_that_cannot_be_are_refused():

@@ -13,7 +13,7 @@ import pyproj
 import pytest
 
 from sasgeo_bench.core.errors import PoseError
-from sasgeo_bench.observing.picture_poses import PoseFacts
+from sasgeo_bench.observing.picture_poses import PicturePose, PoseFacts, PoseTable
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.sensing.photos import read_photo
 from tests import pose_files as cameras
@@ -287,3 +287,10 @@ def test_a_path_that_holds_no_table_is_refused(tmp_path):
         read_pose_table(tmp_path / "none.csv")
     with pytest.raises(PoseError, match=r"holds no images\.bin or images\.txt"):
         read_pose_table(tmp_path, LOCAL)
+
+
+def test_a_picture_whose_row_is_left_out_is_not_said_to_have_none():
+    poses = (PicturePose(name="a.jpg", place=(9.0, 47.0)),)
+    table = PoseTable(path=Path("t.csv"), kind="CSV", poses=poses, left_out={"without a place": ("may/B.jpg",)})
+    assert table.why_not("photos/b.JPG") == "whose row is left out"
+    assert table.why_not("c.jpg") == "that the table does not name, or in another folder"

@@ -140,6 +140,24 @@ def test_frames_that_cannot_be_used_are_left_out_and_counted(made: Made) -> None
     assert "left out: 1 frame that the track does not cover" in quiet(request)[1]  # 3.5 s: a second after its last
 
 
+def test_a_track_of_another_video_is_told(made: Made) -> None:
+    def told(request: VideoRequest) -> list[str]:
+        return [line for line in quiet(request)[1] if "may be of another video" in line]
+
+    assert not told(made())
+    assert not told(made(subtitles=22))  # within three seconds
+    assert told(made(subtitles=90)) == [
+        "DJI_0001.SRT may be of another video than DJI_0001.MP4: it ends at 9 s, the video at 4 s"
+    ]
+    request = made()
+    other = request.path.with_name("DJI_0002.SRT")
+    request.path.with_suffix(".SRT").rename(other)
+    (line,) = told(replace(request, track=other))
+    assert line == "DJI_0002.SRT may be of another video than DJI_0001.MP4: another number in its name"
+    subtitles = other.rename(other.with_name("subtitles.srt"))
+    assert not told(replace(request, track=subtitles))  # taken out of the video by ffmpeg, by any name
+
+
 def test_a_second_call_finds_the_frames_and_one_with_other_words_makes_them_anew(made: Made) -> None:
     request = made()
     folder, first = quiet(request)

@@ -32,7 +32,7 @@ from sasgeo_bench.regions.layers import (
     read_overview,
     write_layers,
 )
-from sasgeo_bench.sensing.ground import read_dem
+from sasgeo_bench.sensing.dem import read_dem
 
 LATTICE = Grid(epsg=32632, west_m=8.0, north_m=-8.0, cell_size_m=2.0, rows=16, cols=16)
 CLASSES = ("building", "water", "bridge")

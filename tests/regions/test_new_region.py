@@ -5,6 +5,7 @@ import datetime as dt
 import json
 import math
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import osmium
@@ -206,6 +207,8 @@ def test_where_none_covers_the_place_the_regional_extract_is_named(garden, tmp_p
     turned = Place.around(f"{LAT},{LON}", "300m")
     with pytest.raises(ExtractError, match=f"{NEW} covers .*: longitude comes first"):
         new_region("mine", turned, into=tmp_path, folders=[garden])
+    with pytest.raises(ExtractError, match=f"{NEW} covers .*: latitude and longitude look swapped in the log"):
+        new_region("mine", replace(turned, source="log"), into=tmp_path, folders=[garden])
     assert list(tmp_path.glob("*.toml")) == []
 
 
@@ -321,6 +324,8 @@ def test_the_place_of_a_flight_is_where_it_was_flown_whatever_its_units(garden, 
         (["--center", "47.1,-109.5", "--size", "2km"], "longitude comes first"),
         (["--photos", "nowhere"], "nowhere is not there"),
         (["--photos", "photos.zip"], "photos.zip is a file: unpack it"),
+        (["--photos", "bare/a.jpg"], "bare/a.jpg is a file: name the folder of the photos, as bare"),
+        (["--photos", "flight.ulg"], "flight.ulg is a file: say --flight for a log"),
         (["--photos", "."], "holds no photo"),
         (["--photos", "bare"], "no photo says where it was taken"),
         (["--bounds", "9,47,9.1,47.1", "--vehicle", "2"], "--vehicle tells which of several a log is of"),
@@ -332,6 +337,7 @@ def test_the_place_of_a_flight_is_where_it_was_flown_whatever_its_units(garden, 
 )
 def test_a_mistake_is_one_line(words, line, mistake, tmp_path):
     (tmp_path / "photos.zip").write_text("an archive")
+    (tmp_path / "flight.ulg").write_text("a log")
     (tmp_path / "bare").mkdir()
     Image.new("L", (4, 3)).save(tmp_path / "bare" / "a.jpg")
     assert line in mistake("new-region", "mine", *words, "--quiet")

@@ -12,7 +12,8 @@ from sasgeo_bench.regions import preview
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
-from sasgeo_bench.regions.preview import GROUND, HIDDEN, paint_evidence, write_preview
+from sasgeo_bench.regions.painting import GROUND, HIDDEN, paint_evidence
+from sasgeo_bench.regions.preview import write_preview
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 
 

@@ -10,7 +10,7 @@ import pytest
 from sasgeo_bench.boards import archive_file, board_files, site_files
 from sasgeo_bench.exchange import release_files
 from sasgeo_bench.running import leak_scan, worker
-from sasgeo_bench.running.segmenting import SegmenterProcess
+from sasgeo_bench.running.segmenter_process import SegmenterProcess
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.scoring import submission_files
 from sasgeo_bench.tasks import task_files

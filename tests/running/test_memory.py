@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a matcher takes counts whatever it hides it in, the kernel holds it where it does that, and nothing is left."""
 
+import ctypes
 import fcntl
 import os
 import signal
@@ -253,3 +254,25 @@ def test_where_scratch_lies_is_looked_up_once(monkeypatch, tmp_path):
     monkeypatch.setattr(memory.os, "stat", look("stat"))
     assert memory._scratch_in_memory(7, tmp_path) == (-1, 0)  # the disk's used space is not memory
     assert opened == [("open", f"/proc/7/root{tmp_path}")]
+
+
+KEPT = """
+import psutil
+from sasgeo_bench.running.memory import be_lean
+{first}
+for size in (30, 24):  # the C library learns from the first one to keep the second
+    before, block = psutil.Process().memory_info().rss, b"x" * (size * 2**20)
+    del block
+print((psutil.Process().memory_info().rss - before) // 2**20)
+"""
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="the C library has no mallopt")
+@pytest.mark.parametrize(
+    ("first", "more", "is_kept"), [("", {}, True), ("be_lean()", {}, False), ("", memory.LEAN, False)]
+)
+def test_a_lean_process_keeps_nothing_large_that_it_freed(first, more, is_kept):
+    plain = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    code = KEPT.format(first=first)
+    ended = subprocess.run([sys.executable, "-c", code], env=plain | more, capture_output=True, text=True, check=True)  # noqa: S603 - our own
+    assert (int(ended.stdout) > 12) == is_kept

@@ -2,6 +2,7 @@
 """Evidence of pictures: made at other places than it was learned from, once, and a fault costs its picture alone."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from itertools import islice
@@ -221,6 +222,8 @@ def test_wrong_tasks_are_refused_in_a_line(pictured):
         of_oracle([Path("out/tasks/clean") / TOWNS[0]])
     with pytest.raises(StoreError, match="make the queries first"):
         of_oracle([Path("out/tasks/aerial/nowhere")])
+    near = [Path(os.path.relpath(folder)) for folder in pictured[:1]]
+    assert [folder.is_absolute() for folder in of_oracle(near)] == [False]  # as the tasks were named
     labels = Path("out/truth/aerial") / TOWNS[1] / "labels.parquet"
     labels.unlink()
     with pytest.raises(StoreError, match=r"labels\.parquet cannot be read .*make the queries again"):

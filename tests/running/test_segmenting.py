@@ -208,7 +208,7 @@ def test_an_error_of_our_own_costs_one_image_and_is_logged(request_of, tmp_path,
         raise RuntimeError("no such thing")
 
     request = request_of("Good")
-    monkeypatch.setattr("sasgeo_bench.running.segmenting.image_bytes", fail)
+    monkeypatch.setattr("sasgeo_bench.running.segmenter_process.image_bytes", fail)
     with SegmenterRun(request, loaded(request)) as run:
         reply = run.segment(tiny_images()[0])
     assert reply.status == "crash"

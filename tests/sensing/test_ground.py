@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.sensing import ground
-from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
+from sasgeo_bench.sensing import dem as dems
+from sasgeo_bench.sensing.dem import read_dem
+from sasgeo_bench.sensing.ground import Dem, Plane
 
 GRID = Grid(epsg=32632, west_m=500_000.0, north_m=5_200_100.0, cell_size_m=10.0, rows=10, cols=12)
 
@@ -168,7 +169,7 @@ def test_a_file_that_is_no_raster_or_of_an_unknown_unit_or_place_is_refused(tmp_
         file.units = ("dBZ",)
     with pytest.raises(CameraError, match="heights in 'dbz', metres or feet"):
         read_dem(path, GRID)
-    monkeypatch.setattr(ground, "_check_source", lambda *_: None)  # asks a library with tables of its own
+    monkeypatch.setattr(dems, "_check_source", lambda *_: None)  # asks a library with tables of its own
     path = write_dem(tmp_path / "dem.tif", slope_of(), crs="IAU_2015:30100")
     with pytest.raises(CameraError, match="cannot be transformed to EPSG:32632"):
         read_dem(path, GRID)

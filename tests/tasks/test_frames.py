@@ -14,15 +14,8 @@ from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.frame_evidence import evidence_of, poses_before
-from sasgeo_bench.tasks.frames import (
-    LABELS,
-    Frame,
-    FrameLabels,
-    encode_webp,
-    frame_of,
-    frame_row,
-    read_labels,
-)
+from sasgeo_bench.tasks.frame_files import LABELS, frame_of, frame_row, read_labels
+from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from tests.tasks.test_task_files import ABOUT, one_query, one_truth
 
 LENS = Intrinsics.from_field_of_view(horizontal_deg=90.0, width_px=40, height_px=40)

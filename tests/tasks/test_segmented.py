@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.core.errors import StoreError
-from sasgeo_bench.regions.preview import PAINT_ORDER
+from sasgeo_bench.regions.painting import PAINT_ORDER
 from sasgeo_bench.sensing.segmentation import SILENT, Segmentation
 from sasgeo_bench.tasks.segmented import MOST_PX, NOTHING, Segmented, read_segmented, segmented_file, write_segmented
 

@@ -17,9 +17,9 @@ from matplotlib.colors import to_rgb
 from sasgeo_bench.core.canvas import DPI
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import GROUND, HIDDEN
+from sasgeo_bench.regions.painting import GROUND, HIDDEN
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.query import TRUTH_SIGMA, Query, Truth
 from sasgeo_bench.tasks.sheet import (
     AGREE,
     DECOY,
@@ -28,6 +28,7 @@ from sasgeo_bench.tasks.sheet import (
     TWIN,
     Panel,
     paint_difference,
+    settled,
     sheet_figure,
     write_sheet,
 )
@@ -94,6 +95,34 @@ def test_a_difference_is_shown_class_by_class():
     one, two = sight([[[1, 1, 0, 0, UNKNOWN]]], ("road_major",)), sight([[[1, 0, 1, 0, 1]]], ("road_major",))
     expected = [to_rgb(colour) for colour in (AGREE, ONLY_SEEN, ONLY_MAPPED, GROUND, HIDDEN)]
     np.testing.assert_allclose(paint_difference(one, two)[0], expected)
+
+
+def test_one_of_two_classes_agrees_with_a_map_of_either_and_with_no_other():
+    roads = ("road_major", "road_minor")
+    seen = sight([[[1, 1, 1, 0]], [[1, 1, 1, 0]]], roads)
+    seen = seen.replace(seen.cells, np.zeros_like(seen.cells))  # as likely as not
+    mapped = sight([[[1, 0, 0, 1]], [[0, 1, 0, 0]]], roads)
+    expected = [to_rgb(colour) for colour in (AGREE, AGREE, ONLY_SEEN, ONLY_MAPPED)]
+    np.testing.assert_allclose(paint_difference(settled(seen, mapped), mapped)[0], expected)
+    sure = seen.replace(seen.cells, np.full_like(seen.cells, 254))  # both are there, as a road on another
+    np.testing.assert_allclose(paint_difference(settled(sure, mapped), mapped)[0, :3], [to_rgb(ONLY_SEEN)] * 3)
+
+
+def test_an_own_picture_is_no_control_and_classes_that_nobody_looks_for_hide_nothing():
+    seen = sight([[[1, 0]], [[UNKNOWN, UNKNOWN]]], ("building", "water"))
+    own = panel(kind="own picture", strength=5.0, strength_unit=TRUTH_SIGMA)
+    drawn = sheet_figure("mine", [replace(own, query=replace(own.query, evidence=seen), at_truth=seen)])
+    texts = "\n".join(text.get_text() for text in drawn.texts)
+    assert "control" not in texts
+    assert "place known to 5 m" in texts
+    picture = drawn.axes[0].images[0].get_array()
+    np.testing.assert_allclose(picture[0, 1], to_rgb(GROUND))
+
+
+def test_a_moment_is_shown_as_a_date():
+    drawn = sheet_figure("mine", [panel(measured={"utc_s": 1718353855.75, "height_m": 120.4})])
+    texts = " ".join(text.get_text() for text in drawn.texts).replace("\n", " ")
+    assert "utc_s 2024-06-14 08:30:55, height_m 120" in texts
 
 
 @pytest.mark.parametrize("rows", [1, 3])

@@ -192,6 +192,7 @@ async function start() {
   document.getElementById("previous").addEventListener("click", () => turn(-1));
   document.getElementById("next").addEventListener("click", () => turn(1));
   await openPlace();
+  if (!wanted.has("outcome") && !chosen().length) field("outcome").value = ""; // no failure to begin with
   draw();
 }
 

@@ -11,7 +11,8 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.sensing.corruptions import COMPOUNDS, CORRUPTIONS, corrupt
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.frames import encode_webp, read_labels
+from sasgeo_bench.tasks.frame_files import read_labels
+from sasgeo_bench.tasks.frames import encode_webp
 from sasgeo_bench.tasks.suites.base import Choice, Seeds, Site, Variant, ViewRequest
 from sasgeo_bench.tasks.suites.corrupted import CORRUPTED, CORRUPTED_REAL, KINDS, corrupted
 from sasgeo_bench.tasks.suites.pictures import Flight

@@ -22,7 +22,7 @@ from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.frame_evidence import evidence_of
-from sasgeo_bench.tasks.frames import read_labels
+from sasgeo_bench.tasks.frame_files import read_labels
 from sasgeo_bench.tasks.pictured_ground import BUILT, GROUNDS, OPEN, Cut, PicturedGround
 from sasgeo_bench.tasks.split import SplitFile, blocks_of, make_split
 from sasgeo_bench.tasks.state import State

@@ -141,7 +141,7 @@ def _lengths(regions: Sequence[Region]) -> str:
 def _map_panel(chart: Axes, region: Region) -> None:
     west, south, east, north = region.grid.bounds_m
     step = max(1, region.grid.rows // 800)
-    pale = 0.55 + 0.45 * paint_overview(region.manifest, region.layers[:, ::step, ::step])
+    pale = 0.55 + 0.45 * (paint_overview(region.manifest, region.layers[:, ::step, ::step]) / 255)
     chart.imshow(pale, extent=(west, east, south, north), interpolation="antialiased")
     for seed, (name, kind, along, colour) in enumerate(DRAWN):
         rng = np.random.default_rng((SEEDS[region.manifest.id], seed))

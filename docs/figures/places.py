@@ -84,7 +84,7 @@ def measured(region: str, out: Path) -> Measured:
     houses = (layers[manifest.classes.index("building")] == 1) & is_mapped
     cells = round(STEP_M / manifest.cell_size_m)  # of a step
     built_cells = (steps(houses, cells) > 0) * steps(is_mapped, cells)
-    colours = (paint_overview(manifest, overview) * 255).astype(np.uint8)[..., ::-1]
+    colours = np.ascontiguousarray(paint_overview(manifest, overview)[..., ::-1])
     scale = SIDE_PX / max(colours.shape[:2])
     west, south, east, north = manifest.bounds_m
     return Measured(

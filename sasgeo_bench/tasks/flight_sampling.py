@@ -175,6 +175,7 @@ def gnss_words(flight: Flight, group: PriorGroup, logged: LoggedFlight | None) -
         f"{(away_m > radius_m).sum()} of {counted(len(radius_m), 'view')} by more than their disc"
     )
     lacks = f", none in {(~is_fix).sum()} of {counted(len(is_fix), 'view')}" if not is_fix.all() else ""
+    lacks += "" if is_fix[0] else ", the first among them: the start is anywhere on the map"
     stated = f"discs of {SIGMAS:g} times the accuracy that it states, {np.median(radius_m):.3g} m (median)"
     return f"of {receiver.name} of the log, {stated}{lacks}"
 

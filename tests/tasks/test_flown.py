@@ -176,8 +176,11 @@ class Logged:
         east, north = np.gradient(self.true_m, axis=0).T
         self.yaw_deg = np.degrees(np.unwrap(np.arctan2(east, north)))
 
-    def write(self, path, *, fused=bool, has_camera=False, second_m=None):
-        """Write it; GNSS is fused at times, and a camera's poses head 0.05 degrees a second too far to the right."""
+    def write(self, path, *, fused=bool, has_camera=False, second_m=None, silent_s=None):
+        """Write it; GNSS is fused at times, and a camera's poses head 0.05 degrees a second too far to the right.
+
+        The second receiver has no fix for 15 s on either side of a moment, by default the middle of the flight.
+        """
         us = autopilots.stamps_us(self.time_s)
         own_m = self.scale * self.true_m
         topics = {
@@ -198,15 +201,15 @@ class Logged:
                 [(one, 4 * fused(time_s + 1.0)) for one, time_s in zip(us, self.time_s, strict=True)],
             ),
         }
-        if second_m is not None:  # a receiver to the east, which states 5 m, and has no fix in the middle of the flight
+        if second_m is not None:  # a receiver to the east, which states 5 m
             wrong = self.lonlat + np.array([second_m / 111_320 / np.cos(np.radians(self.lonlat[0, 1])), 0])
-            half_s = self.time_s[-1] / 2
+            silent_s = self.time_s[-1] / 2 if silent_s is None else silent_s
             topics["sensor_gps", 0] = (
                 autopilots.GPS_114,
                 [
                     (one, 0, lat, lon, 100.0, 147.0, 5.0, 3)
                     for one, (lon, lat), time_s in zip(us, wrong, self.time_s, strict=True)
-                    if abs(time_s - half_s) > 15
+                    if abs(time_s - silent_s) > 15
                 ],
             )
         if has_camera:
@@ -374,6 +377,13 @@ def test_the_priors_of_a_flight_are_the_fixes_of_the_logs_second_receiver(root, 
     out = capsys.readouterr().out
     assert f"prior: fixes {told}" in out
     assert "fixes of sensor_gps 0 are off the truth by 9.0 m (median), in 0 of" in out
+
+
+def test_a_flight_whose_second_receiver_has_no_fix_at_first_begins_anywhere_and_says_so(root, tmp_path) -> None:
+    flown = Logged(root).write(tmp_path / "a.ulg", second_m=9.0, silent_s=10.0)
+    (task,) = make_tasks(request_of(root, "flight-gap", flown=flown, group=PriorGroup.parse("gnss")))
+    assert {prior.center_m for _, prior, frame in discs_of(task) if frame == 0} == {None}
+    assert task.manifest.gnss.endswith(" views, the first among them: the start is anywhere on the map")
 
 
 def test_without_a_second_receiver_a_weak_one_is_drawn_and_the_first_named(root, tmp_path) -> None:

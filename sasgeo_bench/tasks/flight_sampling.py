@@ -150,12 +150,13 @@ class LoggedFlight:
         if not steps.is_logged.any():
             return f"drawn by {drawn}: {own.name} fused GNSS or has no poses along the flight ({own.told})"
         off_pct, off_deg = steps.off(flight.views)
-        turned = "" if math.isnan(off_deg) else f" and its turns by {off_deg:.2g} deg"
-        tell(f"steps of {own.name} are off the receiver by {off_pct:.2g} % of the way{turned} (medians)")
+        if not math.isnan(off_pct):
+            turned = "" if math.isnan(off_deg) else f" and its turns by {off_deg:.2g} deg"
+            tell(f"steps of {own.name} are off the receiver by {off_pct:.2g} % of the way{turned} (medians)")
         words = own.where(steps)
         if not steps.is_logged.all():
             words += f", drawn by the profile {name} where it fused GNSS or has no poses ({own.told})"
-        if math.isnan(off_deg):
+        if np.isnan(steps.yaw_deg).all():
             words += "; turns are drawn, as its headings are the vehicle's and so are those of the truth"
         return f"{words}; noise is declared as the profile {name} has it"
 

@@ -176,10 +176,11 @@ class Logged:
         east, north = np.gradient(self.true_m, axis=0).T
         self.yaw_deg = np.degrees(np.unwrap(np.arctan2(east, north)))
 
-    def write(self, path, *, fused=bool, has_camera=False, second_m=None, silent_s=None):
+    def write(self, path, *, fused=bool, has_camera=False, second_m=None, silent_s=None, every=1):
         """Write it; GNSS is fused at times, and a camera's poses head 0.05 degrees a second too far to the right.
 
-        The second receiver has no fix for 15 s on either side of a moment, by default the middle of the flight.
+        The second receiver has no fix for 15 s on either side of a moment, by default the middle of the flight;
+        of the camera's poses one in `every` is kept.
         """
         us = autopilots.stamps_us(self.time_s)
         own_m = self.scale * self.true_m
@@ -218,7 +219,7 @@ class Logged:
                 "uint64_t timestamp;uint8_t pose_frame;float[3] position;float[4] q;",
                 [
                     (one, 2, north, east, -90.0, *autopilots.turn(yaw))
-                    for one, (east, north), yaw in zip(us, own_m, yaw_deg, strict=True)
+                    for one, (east, north), yaw in list(zip(us, own_m, yaw_deg, strict=True))[::every]
                 ],
             )
         path.write_bytes(autopilots.ulog(topics))
@@ -272,6 +273,16 @@ def test_steps_of_the_logs_own_odometer_are_asked_in_place_of_drawn_ones(root, t
     off_pct, off_deg = map(float, found.groups())
     assert off_pct == pytest.approx(100 * expected, abs=0.6)
     assert off_deg == pytest.approx(0.25, abs=0.05)
+
+
+def test_an_odometer_that_is_lost_all_the_way_has_no_figures_and_headings_of_its_own(root, tmp_path, capsys) -> None:
+    flown = Logged(root).write(tmp_path / "a.ulg", has_camera=True, every=15)  # a pose in 3 s
+    with reporting(print):
+        (task,) = make_tasks(request_of(root, "flight-gap", flown=flown))
+    told = task.manifest.odometry
+    assert re.match(r"of the log \(vehicle_visual_odometry 0\) in (\d+) of \d+ steps, lost in \1 of these", told)
+    assert "turns are drawn" not in told
+    assert "nan" not in capsys.readouterr().out
 
 
 def test_steps_in_which_a_receiver_was_fused_are_drawn_and_counted(root, tmp_path) -> None:

@@ -8,17 +8,20 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated, Final, Self
+from functools import partial
+from typing import Annotated, Final, Self, TypeVar
 
 import numpy as np
 import pandas as pd
 
 from sasgeo_bench.core.errors import ConfigError, MatchError, counted
+from sasgeo_bench.core.folders import uncollected
 from sasgeo_bench.core.progress import spread, tell
 from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.matching.matcher import Prediction, Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.controls import EVERY
 from sasgeo_bench.scoring.decisions import (
@@ -176,6 +179,7 @@ _NUMBER: Final = r"\d+(?:\.\d+)?"
 _PARTS: Final = 5  # folds of the calibration places: thresholds need answers that the rejector was not fitted on
 
 Make = Callable[[], Rejector]
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -451,7 +455,7 @@ class RejectionTask:
 
     matcher: str
     scores: pd.DataFrame
-    predictions: Mapping[str, Prediction]
+    predictions: StoredAnswers
     rules: Mapping[str, Rule]
     split: Split | None
     is_taught: bool
@@ -518,18 +522,57 @@ def evaluate_rejectors(
 
 def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception]:
     """Return by rejector rows of `judge`, of the board and of acceptance, or the error; own confidence comes first."""
-    results: dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception] = {}
-    for name in (OWN, *task.rules):
-        try:
-            if name == OWN:  # it counts as a probability
-                frame, is_calibrated = own_confidence(task.scores, task.split, is_taught=task.is_taught), True
-            else:
-                rule = task.rules[name]
-                frame = judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
-                is_calibrated = rule.card.is_calibrated
-            figures = FIGURE_SCHEMA.frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))
-            taken = acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])
-            results[name] = frame, figures, taken
-        except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped
-            results[name] = error
-    return results
+    own = _tried(partial(own_confidence, task.scores, task.split, is_taught=task.is_taught))
+    found = {OWN: own, **_judged_by_all(task)}  # of the answers none is in memory any more
+    return {
+        name: frame if isinstance(frame, Exception) else _tried(partial(_with_figures, task, name, frame))
+        for name, frame in found.items()
+    }
+
+
+def _judged_by_all(task: RejectionTask) -> dict[str, pd.DataFrame | Exception]:
+    """Return by rejector rows of `judge`, or the error; the answers of a track are in memory at once."""
+    if not task.rules:
+        return {}
+    groups = [*task.scores.groupby(["track", "prior_group"], sort=True).indices.values()]
+    parts = [_judged_group(task, task.scores.iloc[rows]) for rows in groups or [[]]]
+    return {name: _tried(partial(_joined, [part[name] for part in parts])) for name in task.rules}
+
+
+def _judged_group(task: RejectionTask, scores: pd.DataFrame) -> dict[str, pd.DataFrame | Exception]:
+    """Return by rejector rows of `judge` of one track and prior group, or the error; answers are read once for all."""
+    with uncollected():  # the collector would look through all answers over and over
+        answers = _tried(partial(task.predictions.some, scores["query_id"][scores["is_answered"].to_numpy(bool)]))
+        if isinstance(answers, Exception):
+            return dict.fromkeys(task.rules, answers)
+        return {
+            name: _tried(partial(judge, scores, answers, rule.make, rule.split, is_taught=task.is_taught))
+            for name, rule in task.rules.items()
+        }
+
+
+def _joined(parts: Sequence[pd.DataFrame | Exception]) -> pd.DataFrame:
+    """Return the rows of all parts; raise the first error."""
+    frames = []
+    for part in parts:
+        if isinstance(part, Exception):
+            raise part
+        frames.append(part)
+    return frames[0] if len(frames) == 1 else pd.concat(frames, ignore_index=True)
+
+
+def _with_figures(
+    task: RejectionTask, name: str, frame: pd.DataFrame
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Return rows of `judge` with those of the board and of acceptance."""
+    is_calibrated = name == OWN or task.rules[name].card.is_calibrated  # own confidence counts as a probability
+    figures = FIGURE_SCHEMA.frame(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated))
+    return frame, figures, acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])
+
+
+def _tried(work: Callable[[], Found]) -> Found | Exception:
+    """Return a result, or the error: only this entry with this rejector is skipped."""
+    try:
+        return work()
+    except Exception as error:  # noqa: BLE001
+        return error

@@ -2,15 +2,22 @@
 """Rejection on a board: a matcher's own confidence as a rejector, and answers that leave nothing to choose."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import Prediction, RejectorCard
+from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
 from sasgeo_bench.scoring import rejection
 from sasgeo_bench.scoring.decisions import COST_RATIOS, aurc
 from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_statistic, percentile_interval, wilson
-from sasgeo_bench.scoring.rejection import OWN, own_confidence, turns, why_not
+from sasgeo_bench.scoring.rejection import OWN, RejectionTask, Rule, judge, own_confidence, turns, why_not
 from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA
 from sasgeo_bench.tasks.split import SplitFile, make_split
@@ -155,6 +162,57 @@ def test_a_threshold_is_set_on_countries_that_its_fit_has_not_seen(monkeypatch):
     seen.clear()
     rejection._held_back(None, table.assign(country="land0"), {})
     assert len(seen) == 4  # of one country, places are left out
+
+
+def test_answers_are_read_once_for_all_rejectors_and_judged_as_one_by_one():
+    """Rows of two tracks, and each rejector alone with all answers, as a plain loop would."""
+    pose = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
+    frames = [scores(ERRORS[:60]).assign(prior_group=group) for group in ("r500", "r50")]
+    table = pd.concat(frames, ignore_index=True).assign(query_id=[f"q{at}" for at in range(120)], country="land")
+    table = table.assign(place=[f"place{at % 4}" for at in range(120)])
+    answers = [Prediction(query_id=name, candidates=((pose, at % 7),)) for at, name in enumerate(table["query_id"])]
+    stored, read = Answers.of(answers), []
+
+    def reading():
+        read.append(1)
+        return stored
+
+    predictions = StoredAnswers({Path(): reading}, dict.fromkeys(table["query_id"], Path()))
+    rules = {
+        name: Rule(card=replace(Score.card, name=name), make=Score, split=split_of("crossfit"))
+        for name in ("one", "two", "broken")
+    }
+    rules["broken"] = replace(rules["broken"], make=Broken)
+    task = RejectionTask(
+        matcher="mine", scores=table, predictions=predictions, rules=rules, split=split_of("crossfit"), is_taught=False
+    )
+    found = rejection._judged_by_all(task)
+    assert len(read) == 2  # of each prior group, and not of each rejector
+    plain = judge(table, {item.query_id: item for item in answers}, Score, split_of("crossfit"))
+    assert len(plain) == 120
+    for name in ("one", "two"):
+        both = (frame.set_index("query_id").sort_index() for frame in (found[name], plain))
+        pd.testing.assert_frame_equal(*both)
+    assert isinstance(found["broken"], MatchError)
+    assert rejection._judged_by_all(replace(task, rules={})) == {}
+
+
+class Score:
+    """Trusts an answer by its score, and learns which share is false."""
+
+    card = RejectorCard(name="score", version="1", title="Score", source="test", ours="all", licence="Apache-2.0")
+
+    def fit(self, predictions, is_false):
+        self.share = float(is_false.mean())
+        assert len(predictions) == len(is_false)
+
+    def p_false(self, predictions):
+        return np.array([self.share * (1 - item.candidates[0][1] / 10) for item in predictions])
+
+
+class Broken(Score):
+    def p_false(self, predictions):
+        raise ValueError(f"no value for {len(predictions)} answers")
 
 
 def test_what_the_test_place_taught_calibrates_nobody():

@@ -5,7 +5,7 @@ A matcher's own confidence is treated as a rejector that needs no fit.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -247,6 +247,23 @@ def turns(scores: pd.DataFrame, split: Split, *, is_taught: bool = False) -> Ite
         yield Turn(test=test, calibration=own if is_own else ~(test | is_sealed), is_own=is_own)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Alike:
+    """Turns with the same calibration, of which one fit serves all; `test` masks the rows that they score together."""
+
+    turns: tuple[Turn, ...]
+    test: Bools
+
+
+def _by_calibration(every: Iterable[Turn]) -> Iterator[_Alike]:
+    """Yield the turns that share their calibration: many places do."""
+    found: dict[bytes, list[Turn]] = {}
+    for turn in every:
+        found.setdefault(turn.calibration.tobytes(), []).append(turn)
+    for listed in found.values():
+        yield _Alike(turns=tuple(listed), test=np.any([turn.test for turn in listed], axis=0))
+
+
 def judge(
     scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make, split: Split, *, is_taught: bool = False
 ) -> pd.DataFrame:
@@ -268,17 +285,21 @@ def judge(
     for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
         group = needed.iloc[rows]
         answers = {name: predictions[name] for name in group["query_id"][group["is_answered"].to_numpy(bool)]}
-        fits: dict[bytes, _Fit] = {}  # places share their calibration places with others
-        for turn in turns(group, split, is_taught=is_taught):
-            test, calibration = group[turn.test], group[turn.calibration]
-            if len(test) and calibration["is_answered"].any():
-                same = turn.calibration.tobytes()
-                if same not in fits:
-                    fits[same] = _Fit.of(calibration, answers, make)
-                is_judged[rows[turn.test]] = True
-                found = {**_judged(test, fits[same], answers), "is_own_calibration": turn.is_own}
+        for alike in _by_calibration(turns(group, split, is_taught=is_taught)):
+            test, calibration = alike.test, group[alike.turns[0].calibration]
+            if not test.any() or not calibration["is_answered"].any():
+                continue
+            fit = _Fit.of(calibration, answers, make)
+            for turn in alike.turns:
+                p_false, remark = _apply(fit.rejector, group[turn.test], answers)
+                found = {"p_right": 1.0 - p_false, "remark": remark, "is_own_calibration": turn.is_own}
                 for name, values in found.items():
                     columns[name][rows[turn.test]] = values
+            is_judged[rows[test]] = True
+            columns["is_calibrated"][rows[test]] = fit.rejector.card.is_calibrated
+            asked = group[test].assign(p_right=columns["p_right"][rows[test]])
+            for name, values in _decided(fit.known, asked).items():
+                columns[name][rows[test]] = values
     return some_rows(usable.assign(**columns), is_judged)
 
 
@@ -326,11 +347,13 @@ def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taugh
     for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
         is_given[rows] = not np.isnan(p_right[rows]).all()
         group = needed.iloc[rows]
-        for turn in turns(group, split, is_taught=is_taught) if split is not None and is_given[rows].any() else ():
-            known = group[turn.calibration]
+        if split is None or not is_given[rows].any():
+            continue
+        for alike in _by_calibration(turns(group, split, is_taught=is_taught)):
+            known = group[alike.turns[0].calibration]
             if known["is_answered"].any():
-                for name, taken in _decided(known, group[turn.test]).items():
-                    accepted[name][rows[turn.test]] = taken
+                for name, taken in _decided(known, group[alike.test]).items():
+                    accepted[name][rows[alike.test]] = taken
     if split is not None and split.spec.kind == "holdout":
         is_given &= (usable["part"] == "test").to_numpy(bool)
     return some_rows(usable.assign(p_right=p_right, **accepted), is_given)
@@ -350,14 +373,6 @@ class _Fit:
         return cls(
             rejector=rejector, known=calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
         )
-
-
-def _judged(test: pd.DataFrame, fit: _Fit, predictions: Mapping[str, Prediction]) -> dict[str, Floats | str | bool]:
-    """Return the columns that `judge` adds for some rows."""
-    p_false, remark = _apply(fit.rejector, test, predictions)
-    p_right = 1.0 - p_false
-    decided = _decided(fit.known, test.assign(p_right=p_right))
-    return {"p_right": p_right, "remark": remark, "is_calibrated": fit.rejector.card.is_calibrated, **decided}
 
 
 _NAMES: Final = ("query_id", "place", "part", "country", "block")  # of objects, which are chosen faster than texts

@@ -219,6 +219,11 @@ def test_answers_are_read_once_for_all_rejectors_and_judged_as_one_by_one():
         pd.testing.assert_frame_equal(*both)
     assert isinstance(found["broken"], MatchError)
     assert rejection._judged_by_all(replace(task, rules={})) == {}
+    nothing = rejection._judged_by_all(replace(task, scores=table[:0]))
+    assert nothing["one"].columns.tolist() == plain.columns.tolist()
+    assert nothing["one"].empty
+    unread = rejection._judged_by_all(replace(task, predictions=StoredAnswers({}, {})))
+    assert all(isinstance(error, KeyError) for error in unread.values())
 
 
 def test_turns_with_the_same_calibration_share_their_fit_and_come_out_as_each_by_itself(monkeypatch):

@@ -156,7 +156,7 @@ def _stanfords(scored: Scored, shown: Sequence[str], split: Split | None) -> Nam
     """Yield a panel for each matcher and method, of few matchers, those of contrasts first."""
     found: dict[tuple[str, float], dict[tuple[str, str], ProtectionLevels]] = {}
     for matcher in (name for name in shown if name in scored.scores):
-        for item in protection_levels(scored.scores[matcher], scored.predictions[matcher], split):
+        for item in protection_levels(scored.scores[matcher], scored.predictions[matcher].lean(), split):
             key = item.prior_group, item.risk
             rows = {name for name, _ in found.get(key, ())} | {matcher}
             if len(item.level_m) and len(rows) <= MOST_STANFORD:

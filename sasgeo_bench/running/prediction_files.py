@@ -496,6 +496,25 @@ class StoredAnswers(Mapping[str, Prediction]):
         """Return the answers to one task. Raise `StoreError` if they cannot be read."""
         return self._read[task]()
 
+    def some(self, query_ids: Iterable[str]) -> dict[str, Prediction]:
+        """Return the answers to some queries by id, read without those to others; raise KeyError without one.
+
+        >>> answers = StoredAnswers.of(Prediction(query_id=name) for name in "abc")
+        >>> sorted(answers.some(["c", "a"]))
+        ['a', 'c']
+        """
+        asked: dict[Path, set[str]] = {}
+        for name in query_ids:
+            asked.setdefault(self._task_of[name], set()).add(name)
+        found: dict[str, Prediction] = {}
+        for task, names in asked.items():
+            answers = self.of_task(task)
+            rows = [at for at, name in enumerate(answers.table["query_id"].to_pylist()) if name in names]
+            found |= answers.some(rows).found
+        if lost := next((name for names in asked.values() for name in names if name not in found), None):
+            raise KeyError(lost)
+        return found
+
     def __getitem__(self, query_id: str) -> Prediction:
         """Return one answer; raise KeyError without one."""
         task = self._task_of[query_id]

@@ -28,7 +28,8 @@ from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.scoring.base import Floats, Ints, block_codes, check_column, check_weights, weighted_mean
 
 DRAWS: Final = 10_000
-_CHUNK_CELLS: Final = 2**21  # draws x queries in memory at once: 16 MB per column, about ten columns at most
+_CHUNK_CELLS: Final = 2**21  # draws x queries in memory at once, 16 MB; another number would give other draws
+_CACHED_CELLS: Final = 2**16  # draws x sites that are counted at once: fewer than fit a core's cache
 
 
 def seed_of_text(text: str) -> int:
@@ -95,7 +96,7 @@ class ClusterDraws:
         for rows, parts in self._chunks():
             drawn = np.empty((rows, self._sites_count))
             for part in parts:
-                drawn[:, part.sites] = part.weights(rows)
+                drawn[:, part.sites] = part.weights()
             yield drawn if self._site is None else drawn[:, self._site]
 
     def sums(self, table: Floats | csr_array) -> Iterator[Floats]:
@@ -110,7 +111,7 @@ class ClusterDraws:
         for rows, parts in self._chunks():
             total = np.zeros((rows, table.shape[1]))
             for part in parts:
-                total += part.weights(rows) @ of_sites[part.sites]
+                total += part.weights() @ of_sites[part.sites]
             yield total
 
     def _chunks(self) -> Iterator[tuple[int, Iterator["_Picked"]]]:
@@ -127,7 +128,7 @@ class ClusterDraws:
         if self._blocks_of:
             drawn = np.empty((rows, self.blocks_count), dtype=np.int64)
             for group in self._blocks_of:
-                drawn[:, group.children.ravel()] = group.picked(rng, times, draws_within=True).weights(rows)
+                drawn[:, group.children.ravel()] = group.picked(rng, times, draws_within=True).weights()
             times = drawn
         for group in self._sites_of:
             yield group.picked(rng, times, draws_within=self.draws_within)
@@ -203,13 +204,20 @@ class _Picked:
     copies: Ints
     within: NDArray[np.integer] | None
 
-    def weights(self, rows: int) -> Floats:
+    def weights(self) -> Floats:
         """Return how often each site is drawn, shape (D, K * size)."""
         if self.within is None:
             return np.repeat(self.copies, self.size, axis=1).astype(np.float64)
-        cells = self.copies.ravel() * self.size
-        flat = np.repeat(np.arange(len(cells)) * self.size, cells) + self.within
-        return np.bincount(flat, minlength=len(cells) * self.size).reshape(rows, -1).astype(np.float64)
+        found = np.empty((len(self.copies), len(self.sites)))
+        step, end = max(1, _CACHED_CELLS // len(self.sites)), 0
+        for first in range(0, len(found), step):
+            some = slice(first, first + step)
+            cells = self.copies[some].ravel() * self.size
+            begin, end = end, end + int(cells.sum())
+            site = np.repeat(np.arange(0, len(cells) * self.size, self.size), cells)
+            site += self.within[begin:end]
+            found[some] = np.bincount(site, minlength=len(cells) * self.size).reshape(-1, len(self.sites))
+        return found
 
 
 LEVEL: Final = 0.95
@@ -340,7 +348,7 @@ def percentile_ends(draws: ArrayLike, *, level: float = LEVEL) -> tuple[Floats, 
     at = [np.clip(np.ceil(counts * share - 1.0).astype(np.int64), 0, last) for share in (tail, 1.0 - tail)]
     if not columns.size:
         return np.full(len(columns), np.nan), np.full(len(columns), np.nan)
-    columns.partition(np.unique(at), axis=1)  # NaN last
+    columns.sort(axis=1)  # NaN last; a third of the time that partitions at both ends take
     lo, hi = (columns[np.arange(len(columns)), place] for place in at)
     return lo, hi
 

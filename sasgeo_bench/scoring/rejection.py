@@ -5,20 +5,23 @@ A matcher's own confidence is treated as a rejector that needs no fit.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated, Final, Self
+from functools import partial
+from typing import Annotated, Final, Self, TypeVar
 
 import numpy as np
 import pandas as pd
 
 from sasgeo_bench.core.errors import ConfigError, MatchError, counted
+from sasgeo_bench.core.folders import uncollected
 from sasgeo_bench.core.progress import spread, tell
 from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.matching.matcher import Prediction, Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.controls import EVERY
 from sasgeo_bench.scoring.decisions import (
@@ -176,6 +179,7 @@ _NUMBER: Final = r"\d+(?:\.\d+)?"
 _PARTS: Final = 5  # folds of the calibration places: thresholds need answers that the rejector was not fitted on
 
 Make = Callable[[], Rejector]
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -243,6 +247,23 @@ def turns(scores: pd.DataFrame, split: Split, *, is_taught: bool = False) -> Ite
         yield Turn(test=test, calibration=own if is_own else ~(test | is_sealed), is_own=is_own)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Alike:
+    """Turns with the same calibration, of which one fit serves all; `test` masks the rows that they score together."""
+
+    turns: tuple[Turn, ...]
+    test: Bools
+
+
+def _by_calibration(every: Iterable[Turn]) -> Iterator[_Alike]:
+    """Yield the turns that share their calibration: many places do."""
+    found: dict[bytes, list[Turn]] = {}
+    for turn in every:
+        found.setdefault(turn.calibration.tobytes(), []).append(turn)
+    for listed in found.values():
+        yield _Alike(turns=tuple(listed), test=np.any([turn.test for turn in listed], axis=0))
+
+
 def judge(
     scores: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make, split: Split, *, is_taught: bool = False
 ) -> pd.DataFrame:
@@ -264,17 +285,21 @@ def judge(
     for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
         group = needed.iloc[rows]
         answers = {name: predictions[name] for name in group["query_id"][group["is_answered"].to_numpy(bool)]}
-        fits: dict[bytes, _Fit] = {}  # places share their calibration places with others
-        for turn in turns(group, split, is_taught=is_taught):
-            test, calibration = group[turn.test], group[turn.calibration]
-            if len(test) and calibration["is_answered"].any():
-                same = turn.calibration.tobytes()
-                if same not in fits:
-                    fits[same] = _Fit.of(calibration, answers, make)
-                is_judged[rows[turn.test]] = True
-                found = {**_judged(test, fits[same], answers), "is_own_calibration": turn.is_own}
+        for alike in _by_calibration(turns(group, split, is_taught=is_taught)):
+            test, calibration = alike.test, group[alike.turns[0].calibration]
+            if not test.any() or not calibration["is_answered"].any():
+                continue
+            fit = _Fit.of(calibration, answers, make)
+            for turn in alike.turns:
+                p_false, remark = _apply(fit.rejector, group[turn.test], answers)
+                found = {"p_right": 1.0 - p_false, "remark": remark, "is_own_calibration": turn.is_own}
                 for name, values in found.items():
                     columns[name][rows[turn.test]] = values
+            is_judged[rows[test]] = True
+            columns["is_calibrated"][rows[test]] = fit.rejector.card.is_calibrated
+            asked = group[test].assign(p_right=columns["p_right"][rows[test]])
+            for name, values in _decided(fit.known, asked).items():
+                columns[name][rows[test]] = values
     return some_rows(usable.assign(**columns), is_judged)
 
 
@@ -322,11 +347,13 @@ def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taugh
     for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
         is_given[rows] = not np.isnan(p_right[rows]).all()
         group = needed.iloc[rows]
-        for turn in turns(group, split, is_taught=is_taught) if split is not None and is_given[rows].any() else ():
-            known = group[turn.calibration]
+        if split is None or not is_given[rows].any():
+            continue
+        for alike in _by_calibration(turns(group, split, is_taught=is_taught)):
+            known = group[alike.turns[0].calibration]
             if known["is_answered"].any():
-                for name, taken in _decided(known, group[turn.test]).items():
-                    accepted[name][rows[turn.test]] = taken
+                for name, taken in _decided(known, group[alike.test]).items():
+                    accepted[name][rows[alike.test]] = taken
     if split is not None and split.spec.kind == "holdout":
         is_given &= (usable["part"] == "test").to_numpy(bool)
     return some_rows(usable.assign(p_right=p_right, **accepted), is_given)
@@ -346,14 +373,6 @@ class _Fit:
         return cls(
             rejector=rejector, known=calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
         )
-
-
-def _judged(test: pd.DataFrame, fit: _Fit, predictions: Mapping[str, Prediction]) -> dict[str, Floats | str | bool]:
-    """Return the columns that `judge` adds for some rows."""
-    p_false, remark = _apply(fit.rejector, test, predictions)
-    p_right = 1.0 - p_false
-    decided = _decided(fit.known, test.assign(p_right=p_right))
-    return {"p_right": p_right, "remark": remark, "is_calibrated": fit.rejector.card.is_calibrated, **decided}
 
 
 _NAMES: Final = ("query_id", "place", "part", "country", "block")  # of objects, which are chosen faster than texts
@@ -451,7 +470,7 @@ class RejectionTask:
 
     matcher: str
     scores: pd.DataFrame
-    predictions: Mapping[str, Prediction]
+    predictions: StoredAnswers
     rules: Mapping[str, Rule]
     split: Split | None
     is_taught: bool
@@ -518,18 +537,57 @@ def evaluate_rejectors(
 
 def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception]:
     """Return by rejector rows of `judge`, of the board and of acceptance, or the error; own confidence comes first."""
-    results: dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception] = {}
-    for name in (OWN, *task.rules):
-        try:
-            if name == OWN:  # it counts as a probability
-                frame, is_calibrated = own_confidence(task.scores, task.split, is_taught=task.is_taught), True
-            else:
-                rule = task.rules[name]
-                frame = judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
-                is_calibrated = rule.card.is_calibrated
-            figures = FIGURE_SCHEMA.frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))
-            taken = acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])
-            results[name] = frame, figures, taken
-        except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped
-            results[name] = error
-    return results
+    own = _tried(partial(own_confidence, task.scores, task.split, is_taught=task.is_taught))
+    found = {OWN: own, **_judged_by_all(task)}  # of the answers none is in memory any more
+    return {
+        name: frame if isinstance(frame, Exception) else _tried(partial(_with_figures, task, name, frame))
+        for name, frame in found.items()
+    }
+
+
+def _judged_by_all(task: RejectionTask) -> dict[str, pd.DataFrame | Exception]:
+    """Return by rejector rows of `judge`, or the error; the answers of a track are in memory at once."""
+    if not task.rules:
+        return {}
+    groups = [*task.scores.groupby(["track", "prior_group"], sort=True).indices.values()]
+    parts = [_judged_group(task, task.scores.iloc[rows]) for rows in groups or [[]]]
+    return {name: _tried(partial(_joined, [part[name] for part in parts])) for name in task.rules}
+
+
+def _judged_group(task: RejectionTask, scores: pd.DataFrame) -> dict[str, pd.DataFrame | Exception]:
+    """Return by rejector rows of `judge` of one track and prior group, or the error; answers are read once for all."""
+    with uncollected():  # the collector would look through all answers over and over
+        answers = _tried(partial(task.predictions.some, scores["query_id"][scores["is_answered"].to_numpy(bool)]))
+        if isinstance(answers, Exception):
+            return dict.fromkeys(task.rules, answers)
+        return {
+            name: _tried(partial(judge, scores, answers, rule.make, rule.split, is_taught=task.is_taught))
+            for name, rule in task.rules.items()
+        }
+
+
+def _joined(parts: Sequence[pd.DataFrame | Exception]) -> pd.DataFrame:
+    """Return the rows of all parts; raise the first error."""
+    frames = []
+    for part in parts:
+        if isinstance(part, Exception):
+            raise part
+        frames.append(part)
+    return frames[0] if len(frames) == 1 else pd.concat(frames, ignore_index=True)
+
+
+def _with_figures(
+    task: RejectionTask, name: str, frame: pd.DataFrame
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Return rows of `judge` with those of the board and of acceptance."""
+    is_calibrated = name == OWN or task.rules[name].card.is_calibrated  # own confidence counts as a probability
+    figures = FIGURE_SCHEMA.frame(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated))
+    return frame, figures, acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])
+
+
+def _tried(work: Callable[[], Found]) -> Found | Exception:
+    """Return a result, or the error: only this entry with this rejector is skipped."""
+    try:
+        return work()
+    except Exception as error:  # noqa: BLE001
+        return error

@@ -262,6 +262,12 @@ def test_stored_answers_are_those_of_their_tasks_a_task_at_a_time(rows):
     read.clear()
     assert [answers.get(name) for name in (first, first, second, "asked", "elsewhere", "nobody")].count(None) == 3
     assert read == [Path("first"), Path("second")]
+    read.clear()
+    assert answers.some([second, first, second]) == {item.query_id: item for item in (FULL, FAILED)}
+    assert answers.some([second]).keys() == {second}
+    assert sorted(read) == [Path("first"), Path("second"), Path("second")]
+    with pytest.raises(KeyError, match="asked"):
+        answers.some([second, "asked"])
     lean = answers.lean()
     assert {name: replace(item, candidates=()) for name, item in answers.items()} == dict(lean)
     assert not any(item.candidates for item in lean.values())

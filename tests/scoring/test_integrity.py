@@ -2,15 +2,22 @@
 """Rejection on a board: a matcher's own confidence as a rejector, and answers that leave nothing to choose."""
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import Prediction, RejectorCard
+from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
 from sasgeo_bench.scoring import rejection
 from sasgeo_bench.scoring.decisions import COST_RATIOS, aurc
 from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_statistic, percentile_interval, wilson
-from sasgeo_bench.scoring.rejection import OWN, own_confidence, turns, why_not
+from sasgeo_bench.scoring.rejection import OWN, RejectionTask, Rule, judge, own_confidence, turns, why_not
 from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA
 from sasgeo_bench.tasks.split import SplitFile, make_split
@@ -155,6 +162,112 @@ def test_a_threshold_is_set_on_countries_that_its_fit_has_not_seen(monkeypatch):
     seen.clear()
     rejection._held_back(None, table.assign(country="land0"), {})
     assert len(seen) == 4  # of one country, places are left out
+
+
+def split_of_countries():
+    """Return a split of five places, of which the first two are of one country and so calibrate neither of both."""
+    sides = {"place0": "a", "place1": "a", "place2": "a", "place3": "b", "place4": "b"}
+    countries = {"place0": "north", "place1": "north"}
+    grids = {
+        name: Grid(epsg=32632, west_m=5e5 + 1e5 * at, north_m=5.2e6, cell_size_m=1.0, rows=1000, cols=1000)
+        for at, name in enumerate(sides)
+    }
+    places = [
+        {"name": name, "regions": [name], "half": half, "country": countries.get(name, name)}
+        for name, half in sides.items()
+    ]
+    values = {"id": "five", "title": "Five", "kind": "crossfit", "buffer_m": 0.0, "place": places}
+    return make_split(SplitFile.model_validate(values), grids)
+
+
+def judged_table():
+    """Rows of five places, a seventh of them absent, and an answer to each."""
+    pose = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
+    table = scores(ERRORS).assign(query_id=[f"q{at}" for at in range(120)], country="land")
+    table = table.assign(place=[f"place{at // 2 % 5}" for at in range(120)])
+    is_present = np.arange(120) % 7 > 0
+    table = table.assign(is_present=is_present, is_right=table["is_right"] & is_present)
+    found = [Prediction(query_id=name, candidates=((pose, at % 7),)) for at, name in enumerate(table["query_id"])]
+    return table, {item.query_id: item for item in found}
+
+
+def test_answers_are_read_once_for_all_rejectors_and_judged_as_one_by_one():
+    """Rows of two tracks, and each rejector alone with all answers, as a plain loop would."""
+    table, answers = judged_table()
+    table = table.assign(prior_group=["r500", "r50"] * 60)
+    stored, read = Answers.of(answers.values()), []
+
+    def reading():
+        read.append(1)
+        return stored
+
+    predictions = StoredAnswers({Path(): reading}, dict.fromkeys(table["query_id"], Path()))
+    rules = {
+        name: Rule(card=replace(Score.card, name=name), make=Score, split=split_of_countries())
+        for name in ("one", "two", "broken")
+    }
+    rules["broken"] = replace(rules["broken"], make=Broken)
+    task = RejectionTask(
+        matcher="mine", scores=table, predictions=predictions, rules=rules, split=split_of_countries(), is_taught=False
+    )
+    found = rejection._judged_by_all(task)
+    assert len(read) == 2  # of each prior group, and not of each rejector
+    plain = judge(table, answers, Score, split_of_countries())
+    assert len(plain) == 120
+    for name in ("one", "two"):
+        both = (frame.set_index("query_id").sort_index() for frame in (found[name], plain))
+        pd.testing.assert_frame_equal(*both)
+    assert isinstance(found["broken"], MatchError)
+    assert rejection._judged_by_all(replace(task, rules={})) == {}
+    nothing = rejection._judged_by_all(replace(task, scores=table[:0]))
+    assert nothing["one"].columns.tolist() == plain.columns.tolist()
+    assert nothing["one"].empty
+    unread = rejection._judged_by_all(replace(task, predictions=StoredAnswers({}, {})))
+    assert all(isinstance(error, KeyError) for error in unread.values())
+
+
+def test_turns_with_the_same_calibration_share_their_fit_and_come_out_as_each_by_itself(monkeypatch):
+    def held_back(make, calibration, predictions):
+        fitted.append(sorted(set(calibration["place"])))
+        return plainly(make, calibration, predictions)
+
+    table, answers = judged_table()
+    split, fitted, plainly = split_of_countries(), [], rejection._held_back
+    monkeypatch.setattr(rejection, "_held_back", held_back)
+    found = judge(table, answers, Score, split)
+    assert sorted(fitted) == [["place0", "place1"], ["place2"], ["place3"], ["place4"]]  # of five turns
+    assert len(found) == len(table)
+    for turn in turns(table, split):
+        rejector, known = Score(), table[turn.calibration]
+        false = ~known["is_right"].to_numpy(bool)
+        rejector.fit([answers[name] for name in known["query_id"]], false)
+        asked = table[turn.test]
+        p_right = 1.0 - rejector.p_false([answers[name] for name in asked["query_id"]])
+        mine = found[found["query_id"].isin(asked["query_id"])]
+        assert mine["p_right"].tolist() == p_right.tolist()
+        held_back = known.assign(p_right=1.0 - plainly(Score, known, answers))
+        for name, values in rejection._decided(held_back, asked.assign(p_right=p_right)).items():
+            np.testing.assert_array_equal(mine[name].to_numpy(float), values)
+        assert mine["is_own_calibration"].all()
+        assert mine["is_calibrated"].all()
+
+
+class Score:
+    """Trusts an answer by its score, and learns which share is false."""
+
+    card = RejectorCard(name="score", version="1", title="Score", source="test", ours="all", licence="Apache-2.0")
+
+    def fit(self, predictions, is_false):
+        self.share = float(is_false.mean())
+        assert len(predictions) == len(is_false)
+
+    def p_false(self, predictions):
+        return np.array([self.share * (1 - item.candidates[0][1] / 10) for item in predictions])
+
+
+class Broken(Score):
+    def p_false(self, predictions):
+        raise ValueError(f"no value for {len(predictions)} answers")
 
 
 def test_what_the_test_place_taught_calibrates_nobody():

@@ -2,6 +2,7 @@
 """Intervals hold as often as they say, count blocks instead of queries, and share their draws."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from sasgeo_bench.scoring.intervals import (
     difference_interval,
     effective_count,
     mean_interval,
+    percentile_ends,
     percentile_interval,
     share_interval,
     wilson,
@@ -103,6 +105,36 @@ def test_the_same_seed_gives_the_same_draws_and_another_seed_others(monkeypatch)
     chunks = list(one.weights())
     assert [len(chunk) for chunk in chunks] == [8] * 6 + [2]
     assert not np.array_equal(chunks[0], chunks[1])
+
+
+@pytest.mark.parametrize("cells", [1, 7, 2**16])
+def test_weights_count_every_site_as_often_as_it_is_drawn_however_many_are_counted_at_once(cells, monkeypatch) -> None:
+    monkeypatch.setattr(intervals, "_CACHED_CELLS", cells)
+    blocks = np.repeat(np.arange(9), np.arange(9) % 3 + 2)  # blocks of two, three and four queries
+    drawn = ClusterDraws(blocks=blocks, places=blocks // 2, seed=3, draws=40)
+    ((rows, parts),) = drawn._chunks()
+    plain = np.zeros((rows, len(blocks)))
+    for part in parts:
+        picked = iter(part.within.tolist())
+        for draw, at in product(range(rows), range(part.copies.shape[1])):
+            for _ in range(part.size * part.copies[draw, at]):
+                plain[draw, part.sites[at * part.size + next(picked)]] += 1
+        assert next(picked, None) is None
+    assert plain.sum() > 0
+    assert np.array_equal(np.vstack(list(drawn.weights())), plain)
+
+
+def test_ends_are_the_draws_in_their_order_with_a_fortieth_beyond_either() -> None:
+    table = np.random.default_rng(4).normal(size=(400, 3)).round(1)  # many are equal
+    table[::3, 1] = math.nan
+    table[:, 2] = math.nan
+    lo, hi = percentile_ends(table)
+    for at, column in enumerate(table.T.tolist()[:2]):
+        known = sorted(value for value in column if not math.isnan(value))
+        tail = math.ceil(len(known) / 40) - 1
+        assert (lo[at], hi[at]) == (known[tail], known[math.ceil(len(known) * 39 / 40) - 1])
+    assert math.isnan(lo[2])
+    assert math.isnan(hi[2])
 
 
 @given(blocks=BLOCKS, draws_within=st.booleans())

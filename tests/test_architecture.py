@@ -4,6 +4,7 @@
 import ast
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -42,19 +43,23 @@ def room_of(module: str) -> str:
     return module.split(".", maxsplit=1)[0]
 
 
+@cache
+def import_nodes(text: str) -> tuple[ast.Import | ast.ImportFrom, ...]:
+    """Return the imports of a file; several tests ask for those of every file, and to parse all takes seconds."""
+    return tuple(node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom))
+
+
 def imported_modules(text: str, modules: set[str]) -> Iterator[tuple[int, str]]:
     """Line and module of every import of our own package, wherever in the file it stands."""
-    for node in ast.walk(ast.parse(text)):
+    for node in import_nodes(text):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.level:
             names = [f"{PACKAGE}.{'.' * node.level}{node.module or ''}"]  # relative: in no room, so always a fault
-        elif isinstance(node, ast.ImportFrom):
+        else:
             # `from sasgeo_bench.osm import read` takes a module, `from sasgeo_bench.geometry.grid import Grid` a name.
             full = [f"{node.module}.{alias.name}" for alias in node.names]
             names = [name if inside(name) in modules else str(node.module) for name in full]
-        else:
-            continue
         for name in names:
             if name == PACKAGE or name.startswith(f"{PACKAGE}."):
                 yield node.lineno, inside(name)

@@ -259,6 +259,7 @@ def test_what_is_read_of_the_log_of_an_autopilot_is_printed_with_its_messages(pr
     ]
 
 
+@pytest.mark.slow
 def test_where_odometry_and_priors_are_from_is_said_and_shown_by_inspect(program, mistake, lay_towns, tmp_path) -> None:
     logged = Logged(lay_towns(tmp_path / "out", "town-grid"))
     logged.write(tmp_path / "a.ulg", has_camera=True, second_m=9.0)

@@ -285,6 +285,7 @@ def test_an_odometer_that_is_lost_all_the_way_has_no_figures_and_headings_of_its
     assert "nan" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_steps_in_which_a_receiver_was_fused_are_drawn_and_counted(root, tmp_path) -> None:
     logged = Logged(root)
     end_s = float(logged.time_s[-1])
@@ -318,6 +319,7 @@ def test_the_step_of_a_carried_drone_is_the_logs_too(root, tmp_path) -> None:
     assert 0.4 < np.mean(is_own) < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("odometry", "why"),
     [
@@ -334,6 +336,7 @@ def test_an_estimate_that_fused_gnss_is_named_and_the_profile_taken(root, tmp_pa
     assert "F1 own odometer" not in {truth.kind for truth in task.truths}
 
 
+@pytest.mark.slow
 def test_a_profile_of_ones_own_is_what_the_odometer_declares_and_is_drawn_by(root, tmp_path) -> None:
     logged = Logged(root)
     mine = load_profile("wheel-poor").model_copy(update={"id": "mine", "slip": SlipDrift(sigma_pct=30.0, length_m=5.0)})
@@ -397,6 +400,7 @@ def test_a_flight_whose_second_receiver_has_no_fix_at_first_begins_anywhere_and_
     assert task.manifest.gnss.endswith(" views, the first among them: the start is anywhere on the map")
 
 
+@pytest.mark.slow
 def test_without_a_second_receiver_a_weak_one_is_drawn_and_the_first_named(root, tmp_path) -> None:
     logged = Logged(root)
     flown = logged.write(tmp_path / "a.ulg", second_m=0.0)

@@ -109,6 +109,7 @@ def hamlet(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_real_pictures_of_a_site_show_one_place_and_one_ground_and_lose_more_at_each_severity(hamlet):
     name = CORRUPTED_REAL.card.name
     truths = {item.query_id: item for item in read_truths(hamlet / "truth" / name / "hamlet")}

@@ -11,6 +11,7 @@ from sasgeo_bench.boards.board_files import BOARD
 from sasgeo_bench.boards.run_cases import is_run
 from sasgeo_bench.cli.built_regions import MOST_NAMED
 from sasgeo_bench.core.errors import ConfigError, named
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.observing.results import PAGE, TABLE
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.regions.region_spec import list_region_files
@@ -41,7 +42,7 @@ def is_split(target: str) -> bool:
 def _is_region_file(path: Path) -> bool:
     """Return whether a file has what every region file has, and no split."""
     try:
-        return path.suffix == ".toml" and "extract" in tomllib.loads(path.read_text(encoding="utf-8"))
+        return path.suffix == ".toml" and "extract" in tomllib.loads(plain_file(path).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return False
 

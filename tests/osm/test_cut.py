@@ -115,7 +115,7 @@ def test_a_history_is_cut_at_a_day_and_the_cut_is_of_one_state(tmp_path):
 @pytest.mark.parametrize(
     ("name", "lonlat"),
     [
-        ("andorra-2025-01-19", (1.5218, 42.5075)),
+        pytest.param("andorra-2025-01-19", (1.5218, 42.5075), marks=pytest.mark.slow),
         ("helsinki-2019-04-21", (24.95, 60.17)),
     ],
 )

@@ -355,6 +355,7 @@ def test_a_large_extract_is_cut_before_it_is_read_and_gives_the_same(garden, tmp
     assert "spares" not in lines
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_a_real_place_is_found_among_all_extracts_and_of_its_border_that_is_said(real_extracts, tmp_path):
     spec = read_region_file(

@@ -82,6 +82,9 @@ def lay_village(folder: Path, out: Path, name: str, *, largest_m: float, seed: i
     return Village(spec=spec, folder=folder, out=out)
 
 
+pytestmark = pytest.mark.slow  # it draws several tasks of pictures first
+
+
 @pytest.fixture(scope="module")
 def village(tmp_path_factory: pytest.TempPathFactory) -> Village:
     root = tmp_path_factory.mktemp("village")
@@ -231,7 +234,6 @@ def test_sites_take_turns_in_the_kinds_of_ground_and_find_their_number_on_the_pi
         assert (kind == BUILT) == (houses.mean() >= 0.1) or abs(houses.mean() - 0.1) < 0.01
 
 
-@pytest.mark.slow
 def test_every_view_and_picture_of_every_site_is_shown(over):
     scene, sites = over
     suite = suite_on(scene)
@@ -263,7 +265,6 @@ def test_a_hole_that_hides_a_small_view_makes_no_site(village):
     assert suite.ground_at(scene_of(holed), pose) is None
 
 
-@pytest.mark.slow
 def test_places_of_sites_follow_no_lattice(village):
     scene = scene_of(village.pictured())
     sites = [site for root in range(4) for site in sites_of(scene, 8, root=root)]
@@ -272,7 +273,6 @@ def test_places_of_sites_follow_no_lattice(village):
     assert (np.histogram2d(*phases.T, bins=2, range=[(0, 1), (0, 1)])[0] > 0.12 * len(sites)).all()
 
 
-@pytest.mark.slow
 @pytest.mark.real
 def test_a_picture_of_half_a_region_carries_as_many_sites_as_are_asked_for(real_extracts, tmp_path):
     spec = read_region_file(list_region_files()["pardubice-ortho"])
@@ -341,7 +341,6 @@ class Dull(PicturedGround):
         )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("is_dull_here", [False, True])
 def test_the_variance_of_the_laplacian_does_not_tell_a_view_of_another_town(is_dull_here, village):
     sharp = village.pictured()
@@ -427,7 +426,6 @@ def test_frames_lie_around_the_last_one_which_is_the_view_alone(over):
 # --- flights
 
 
-@pytest.mark.slow
 def test_a_flight_over_a_mosaic_stays_on_it_and_shows_where_its_truths_are(village):
     request = request_of(village.spec, village.out, village.folder, suite="flight-real-image", count=2)
     (task,) = make_tasks(request)

@@ -177,7 +177,7 @@ def first_runs() -> dict[str, Line]:
 EVERY = [line for document in DOCUMENTS for line in commands(document)]
 RUN = first_runs()
 WALKS = sorted({line.document for line in RUN.values()}, key=DOCUMENTS.index)
-LONG = tuple(f"docs/howto/{name}.md" for name in ("imagery", "matcher", "submission", "tracker"))
+FIRST = ("README.md", "docs/quickstart.md")  # the others take a minute, and are among the slow ones
 
 
 def test_every_command_of_a_document_is_one_that_this_test_knows() -> None:
@@ -300,7 +300,7 @@ def by_one_process(words: list[str]) -> list[str]:
 
 @pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize(
-    "document", [pytest.param(one, marks=pytest.mark.slow if one in LONG else ()) for one in WALKS]
+    "document", [pytest.param(one, marks=() if one in FIRST else pytest.mark.slow) for one in WALKS]
 )
 def test_the_commands_of_a_document_do_what_they_say(
     document: str, reader: Path, monkeypatch: pytest.MonkeyPatch

@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -12,15 +13,14 @@ from typing import TYPE_CHECKING, Final, Self
 
 import cv2
 import numpy as np
-import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import FEATURES, LAYERS, read_manifest, read_region
 from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
@@ -73,6 +73,11 @@ def read_field(
     `likeness`, shape (C, FAR + 1), is that of `rates.likeness` or `likeness_by_hand`; `trust`, shape (C, STRATA), that
     of `weights.fit_trust`, 1 without it. Cells have a whole number of map cells a side, of about `cell_size_m`.
     """
+    by_stratum = None if trust is None else trust.tolist()
+    kept = region.kept("field", likeness=likeness.tolist(), trust=by_stratum, cell_size_m=cell_size_m)
+    with suppress(StoreError):  # removed meanwhile: it is made
+        if kept is not None:
+            return StoredField.open(kept).field()
     factor = max(1, round(cell_size_m / region.grid.cell_size_m))
     grid = region.grid.coarsen(factor)
     around = ((0, -region.grid.rows % factor), (0, -region.grid.cols % factor))
@@ -187,6 +192,10 @@ def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
     >>> burnt(house, Evidence(classes=("building",), cells=cells, cell_size_m=1.0)).cells.tolist()
     [[[1, 1, 0, 2], [1, 1, 0, 2]]]
     """
+    import pandas as pd  # noqa: PLC0415 - views without vectors need no tables, and no GDAL
+
+    from sasgeo_bench.regions.layers import burn_layers, make_paint  # noqa: PLC0415
+
     features = as_features(vectors)
     is_line = features["width_m"].notna().to_numpy()
     seen = {*vectors["class"], *((BRIDGE,) if is_line.any() else ())}

@@ -2,6 +2,7 @@
 """Map fields and view templates: the linear form of Eqs. 7-8 of the SASGeo paper, in cells of any size."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from typing import Final, Protocol, Self, TypeVar
@@ -102,6 +103,10 @@ class Field:
     def known(self) -> NDArray[np.uint8]:
         """Return FULL where the map is known, else 0, shape (rows, cols): a view of the cells."""
         return self.cells[..., -1]
+
+    def add_levels(self, made: Iterable[Level]) -> None:
+        """Take levels that were made of it before, as `level` makes them."""
+        self._levels.update({level.factor: level for level in made})
 
     def level(self, factor: int) -> Level:
         """Return the map in cells of `factor` of its own a side; each level is made once."""

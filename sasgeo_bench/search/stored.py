@@ -65,6 +65,12 @@ class StoredField:
         except Exception as error:  # NumPy parses a header as Python, which fails at damage with errors of many kinds
             raise _damaged(self.folder, error) from error
 
+    def field(self) -> Field:
+        """Return it as a field: the levels that are stored are mapped, others are made when they are asked for."""
+        found = Field(grid=self.grid, cells=self.level(1).cells)
+        found.add_levels(map(self.level, self.thinner))
+        return found
+
     def level(self, factor: int) -> Level:
         """Return the map in cells of `factor` of its own a side; raise `StoreError` if that level is not stored."""
         if factor not in self.thinner:

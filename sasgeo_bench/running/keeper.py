@@ -18,11 +18,15 @@ from sasgeo_bench.sasgeo.raster import store_field
 from sasgeo_bench.search.view import Chart
 
 
+_FACTORS: Final = (1, 2, 4, 8, 16)  # views of up to 1 km; the next level takes as long as all of these
+
+
 def _field(
     region: Path, into: Path, *, likeness: list[list[float]], trust: list[list[float]] | None, cell_size_m: float
 ) -> None:
     by_stratum = None if trust is None else np.array(trust)
-    store_field(region, into / "levels", np.array(likeness), trust=by_stratum, cell_size_m=cell_size_m)
+    grades = np.array(likeness)
+    store_field(region, into / "levels", grades, trust=by_stratum, cell_size_m=cell_size_m, factors=_FACTORS)
     for path in (into / "levels").iterdir():
         path.rename(into / path.name)
     (into / "levels").rmdir()

@@ -26,7 +26,7 @@ from sasgeo_bench.regions.region_files import FEATURES, LAYERS, read_manifest, r
 from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
 from sasgeo_bench.sasgeo.weights import STRATA, Gains, strata, weigh
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
-from sasgeo_bench.search.stored import StoredField, store_levels
+from sasgeo_bench.search.stored import FACTORS, StoredField, store_levels
 from sasgeo_bench.tasks.vectors import as_features
 
 if TYPE_CHECKING:
@@ -103,12 +103,13 @@ def store_field(
     *,
     trust: NDArray[np.float64] | None = None,
     cell_size_m: float = CELL_M,
+    factors: tuple[int, ...] = FACTORS,
 ) -> StoredField:
     """Store what `read_field` makes of a region, in levels on disk: window by window, so that it may be a country.
 
     `region` is the folder of the region, `into` that of the levels; levels that are there of the same map, settings and
-    format are opened. The other arguments are those of `read_field`. Raise `StoreError` if the region is damaged or the
-    folder cannot be written.
+    format are opened. `factors` are as of `store_levels`, the other arguments those of `read_field`. Raise `StoreError`
+    if the region is damaged or the folder cannot be written.
     """
     manifest = read_manifest(region)
     factor = max(1, round(cell_size_m / manifest.cell_size_m))
@@ -132,7 +133,7 @@ def store_field(
         )
         return Field(grid=window, cells=field.cells[row : row + window.rows, col : col + window.cols])
 
-    return store_levels(into, grid, len(manifest.classes), paint, key=key)
+    return store_levels(into, grid, len(manifest.classes), paint, key=key, factors=factors)
 
 
 def _degree(

@@ -12,6 +12,7 @@ from sasgeo_bench.running import keeper, kept, sandbox
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.raster import likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.weights import STRATA
 from sasgeo_bench.search.stored import FACTORS
 from sasgeo_bench.search.view import Chart
 from sasgeo_bench.tasks import task_files
@@ -57,10 +58,12 @@ def keeping(region):
     return found
 
 
-def test_a_kept_field_is_that_which_would_be_made_on_every_level(place, task, here):
+@pytest.mark.parametrize("is_trusted", [False, True])
+def test_a_kept_field_is_that_which_would_be_made_on_every_level(is_trusted, place, task, here):
     region = town_of(place, task)
     likeness = likeness_by_hand(read_manifest(region).classes)
-    made, found = (read_field(one, likeness) for one in (read_region(region), keeping(region)))
+    trust = np.linspace(1.0, 0.3, len(likeness) * STRATA).reshape(-1, STRATA) if is_trusted else None
+    made, found = (read_field(one, likeness, trust=trust) for one in (read_region(region), keeping(region)))
     assert len(here) == 1
     assert found.grid == made.grid
     for factor in (*FACTORS, 64):

@@ -17,7 +17,6 @@ from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.raster import store_field
 from sasgeo_bench.search.view import Chart
 
-
 _FACTORS: Final = (1, 2, 4, 8, 16)  # views of up to 1 km; the next level takes as long as all of these
 
 

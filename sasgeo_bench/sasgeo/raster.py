@@ -25,7 +25,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import FEATURES, LAYERS, read_manifest, read_region
 from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
 from sasgeo_bench.sasgeo.weights import STRATA, Gains, strata, weigh
-from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
+from sasgeo_bench.search.field import FULL, Cells, Field, Template, between, squares
 from sasgeo_bench.search.stored import FACTORS, StoredField, store_levels
 from sasgeo_bench.tasks.vectors import as_features
 
@@ -36,7 +36,7 @@ BRIDGE: Final = "bridge"
 LEVEL_M: Final = 24.0  # standard deviation of the ground that a class is compared with; from train places
 REPEATED: Final = 3e3  # nats2 m2 of a class that say half of what as many independent cells would; from train places
 _LEAST: Final = 1e-6
-_FIELD_VERSION: Final = 1  # raised whenever the same map and settings give other levels
+_FIELD_VERSION: Final = 2  # raised whenever the same map and settings give other levels
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
 
 
@@ -83,8 +83,8 @@ def read_field(
     around = ((0, -region.grid.rows % factor), (0, -region.grid.cols % factor))
     known = _share(region.known(), around, grid) > FULL // 2
     stamped = None if trust is None else strata(region)
-    cells = np.zeros((*grid.shape, len(region.classes) + 1), dtype=np.uint8)
-    cells[known, -1] = FULL
+    cells = Cells.zeros(len(region.classes) + 1, grid.shape)
+    cells.band(len(region.classes))[known] = FULL
     for at, name in enumerate(region.classes):
         if trust is None or stamped is None:
             shares, weights = [_share(region.layer(name) == PRESENT, around, grid)], np.ones(1)
@@ -92,7 +92,7 @@ def read_field(
             shares, weights = [_share(stamped[at] == index, around, grid) for index in range(STRATA)], trust[at]
         degree = _degree(shares, weights, likeness[at], grid)
         degree[~known] = 0
-        cells[..., at] = degree
+        cells.band(at)[:] = degree
     return Field(grid=grid, cells=cells)
 
 
@@ -131,7 +131,7 @@ def store_field(
             round(shift_m / grid.cell_size_m)
             for shift_m in (field.grid.north_m - window.north_m, window.west_m - field.grid.west_m)
         )
-        return Field(grid=window, cells=field.cells[row : row + window.rows, col : col + window.cols])
+        return Field(grid=window, cells=field.cells.cut(row, col, window.shape))
 
     return store_levels(into, grid, len(manifest.classes), paint, key=key, factors=factors)
 
@@ -273,12 +273,12 @@ def explained(evidence: Evidence, classes: Sequence[str], field: Field, poses: S
     Examples
     --------
     >>> grid = Grid(epsg=0, west_m=-4.0, north_m=4.0, cell_size_m=2.0, rows=4, cols=4)
-    >>> cells = np.full((4, 4, 2), FULL, dtype=np.uint8)
-    >>> cells[:, 2:, 0] = 0  # water in the west
+    >>> water, known = np.full((1, 4, 4), FULL, dtype=np.uint8), np.full((4, 4), FULL, dtype=np.uint8)
+    >>> water[:, :, 2:] = 0  # in the west
     >>> seen = np.tile([0.3, 0.3, 0.1, 0.1], (1, 4, 1))
     >>> view = Evidence.of_probabilities(("water",), seen, cell_size_m=2.0)
     >>> north, south = (Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg) for yaw_deg in (0.0, 180.0))
-    >>> explained(view, ("water",), Field(grid=grid, cells=cells), [north, south]).round(2).tolist()
+    >>> explained(view, ("water",), Field.of(grid=grid, layers=water, known=known), [north, south]).round(2).tolist()
     [[0.51], [0.0]]
     """
     pool = max(1, round(field.grid.cell_size_m / evidence.cell_size_m))
@@ -292,9 +292,9 @@ def explained(evidence: Evidence, classes: Sequence[str], field: Field, poses: S
     seen = seen / np.maximum(known, _LEAST)
     found = np.zeros((len(poses), len(classes)))
     for row, pose in zip(found, poses, strict=True):
-        under = warped(field.cells, between(frame, pose, field.grid), frame.shape)
-        for number, one, weights in zip(at, seen, known * under[..., -1] / FULL, strict=True):
-            row[number] = _explained(one, under[..., number] / FULL, weights)
+        under = field.cells.under(between(frame, pose, field.grid), frame.shape)
+        for number, one, weights in zip(at, seen, known * under.band(len(classes)) / FULL, strict=True):
+            row[number] = _explained(one, under.band(number) / FULL, weights)
     return found
 
 
@@ -344,10 +344,10 @@ class RasterView:
         weights, known = summed[: len(active)], summed[len(active) :]
         total = np.zeros((len(poses), len(self.weights)))
         for row, pose in zip(total, poses, strict=True):
-            under = warped(field.cells, between(frame, pose, field.grid), frame.shape)
-            row[active] = np.einsum("cij,ij->c", known, under[..., -1].astype(np.float32))
+            under = field.cells.under(between(frame, pose, field.grid), frame.shape)
+            row[active] = np.einsum("cij,ij->c", known, under.band(len(self.weights)).astype(np.float32))
             for at, layer in zip(active.tolist(), weights, strict=True):
-                row[at] += np.vdot(layer, under[..., at].astype(np.float32))
+                row[at] += np.vdot(layer, under.band(at).astype(np.float32))
         return total / FULL
 
     def levelled(self) -> Self:

@@ -21,7 +21,6 @@ from typing import Final
 
 from pydantic import JsonValue
 
-import sasgeo_bench
 from sasgeo_bench.core.errors import SasgeoError, StoreError
 from sasgeo_bench.core.folders import locked, remove_tree
 from sasgeo_bench.core.progress import tell
@@ -160,7 +159,7 @@ def _make_room(needed: int) -> None:
 @cache
 def _code() -> str:
     """Return the SHA-256 of all files of this package: a change in any makes all anew."""
-    package, digest = Path(sasgeo_bench.__file__).parent, hashlib.sha256()
+    package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted((*package.rglob("*.py"), *package.rglob("*.toml"))):
         data = path.read_bytes()
         digest.update(f"{path.relative_to(package).as_posix()}\0{len(data)}\0".encode() + data)

@@ -44,8 +44,14 @@ def kept_folder() -> Path:
 
 def most_bytes() -> int:
     """Return how many bytes are kept at most, as `SASGEO_KEPT_MB` says."""
-    text = os.environ.get(VARIABLE, "")
-    return int(text) * 10**6 if text.isdecimal() else MOST_MB * 10**6
+    return _most_mb(os.environ.get(VARIABLE, "")) * 10**6
+
+
+@cache
+def _most_mb(text: str) -> int:
+    if text and not text.isdecimal():
+        tell(f"{VARIABLE} is {text!r}, no whole number of megabytes: {MOST_MB} are kept at most")
+    return int(text) if text.isdecimal() else MOST_MB
 
 
 def shelf_of(region: Path) -> Path | None:
@@ -54,7 +60,7 @@ def shelf_of(region: Path) -> Path | None:
         manifest = read_manifest(region)
         if _is_worth_it(manifest):
             shelf = kept_folder().resolve() / manifest.digest
-            shelf.mkdir(parents=True, exist_ok=True)
+            shelf.mkdir(mode=0o700, parents=True, exist_ok=True)  # a map may be private
             return shelf
     return None
 

@@ -470,12 +470,15 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
 
     _region: Path | None = None
     _learned: str | None = None
+    _seen: int = -1  # which of its processes was asked a query, or taught, last
 
     def learn(self, regions: Mapping[str, Path], pairs: Iterable[tuple[bytes, Truth]]) -> Reply:
         """Train on queries, each a row in Arrow's stream format, and their truths, with maps by name."""
         sizes, blob = pairs_bytes(pairs)
         maps = {name: str(path.resolve()) for name, path in regions.items()}
-        return self._learn(blob, regions=maps, query_bytes=sizes)
+        reply = self._learn(blob, regions=maps, query_bytes=sizes)
+        self._seen = self.starts
+        return reply
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, given the learned text."""
@@ -507,6 +510,7 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
             again = self.prepare(self._region, self._learned)
             if again.status != "ok":
                 return again
+        self._seen = self.starts
         reply = self._ask("match", query, timeout_s=self.limits.match_s, top_k=top_k)
         if reply.status in {"timeout", "crash"} and self._is_gone():
             self.end()
@@ -517,9 +521,11 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
         wants = checked(_WANTED, asked)
         if self._region is None or wants.nonce != nonce:
             raise MatchError("question does not belong to this map")
-        left_s = max(deadline - time.monotonic(), 0.0)
+        if self._seen == self.starts:  # settings could tell its next process what it saw
+            return {"folder": None}
+        timeout_s = max(deadline - time.monotonic(), 0.0) / 2  # the matcher may have to make it itself
         wanted = wants.wanted
-        folder = kept_of(self._region, wanted.what, wanted.settings, digest=wanted.digest, timeout_s=left_s)
+        folder = kept_of(self._region, wanted.what, wanted.settings, digest=wanted.digest, timeout_s=timeout_s)
         return {"folder": None if folder is None else str(folder)}
 
     def _policy(self, scratch: str) -> sandbox.Policy:

@@ -16,6 +16,7 @@ from sasgeo_bench.sasgeo.weights import STRATA
 from sasgeo_bench.search.stored import FACTORS
 from sasgeo_bench.search.view import Chart
 from sasgeo_bench.tasks import task_files
+from tests.threaded import Threaded
 
 SETTINGS = {"thin": ["road_major", "railway"], "reach_m": 4.0}
 shut_in = pytest.mark.skipif(sandbox.landlock_version() <= 0, reason="this kernel has no Landlock to refuse files with")
@@ -217,6 +218,27 @@ def test_a_matcher_reads_what_is_kept_of_its_map_alone_and_changes_nothing(place
     ready, found = replies(place, task, "hostile:ReadsWhatIsKept")
     assert ready.status == "ok", ready.message
     assert found.found.diagnostics == {"is there": 1.0, "other maps": 0.0, "written": 0.0, "nonsense": 0.0}
+
+
+def test_a_process_that_has_seen_a_query_is_given_nothing(place, task, here):
+    region = town_of(place, task)
+    query = task_files.query_bytes(next(iter(task_files.read_queries(task))))
+    with Threaded(spec="graph_only", reach=Reach(readable=[region], hidden=[]), limits=Limits()) as worker:
+        assert worker.prepare(region).status == "ok"
+        assert len(here) == 1
+        assert worker.match(query, top_k=1).status == "ok"
+        for path in kept.shelf_of(region).iterdir():
+            kept.remove_tree(path)
+        assert worker.prepare(region).status == "ok"
+    assert len(here) == 1
+
+
+def test_a_size_that_is_none_is_told_once_and_the_usual_one_holds(monkeypatch):
+    told = []
+    monkeypatch.setattr(kept, "tell", told.append)
+    monkeypatch.setenv("SASGEO_KEPT_MB", "1 GB")
+    assert [kept.most_bytes() for _ in range(2)] == [kept.MOST_MB * 10**6] * 2
+    assert told == ["SASGEO_KEPT_MB is '1 GB', no whole number of megabytes: 4000 are kept at most"]
 
 
 def test_a_matcher_that_asks_for_something_else_is_refused(place, task):

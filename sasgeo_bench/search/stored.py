@@ -19,7 +19,7 @@ from sasgeo_bench.core.json import read_json
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.search.field import FOUR, Cells, Field, Level, fours_of, is_thin, round_kernel
+from sasgeo_bench.search.field import FOUR, Cells, Field, Level, averaged, dilated, fours_of, round_kernel, thinner_of
 
 FACTORS: Final = (1, 2, 4, 8, 16, 32)  # cells of 2 m: views of up to 2 km
 WINDOW_CELLS: Final = 2048  # of the map's own cells: 14 bands of one window take 60 MB
@@ -220,43 +220,29 @@ def _store_level(folder: Path, base: Cells, grid: Grid, factor: int, window_cell
     # as it is and spread.
     shape, bands = grid.coarsen(factor).shape, base.count
     plain, grown = (_made(folder, name, shape, bands) for name in (_name(factor), "grown.npy"))
-    before, after = np.zeros(bands), np.zeros(bands)
+    before, after = np.zeros((len(base.fours), FOUR)), np.zeros((len(base.fours), FOUR))
     kernel = round_kernel(factor)
     for row, col, window in grid.windows(window_cells):
         top, left = max(row - factor, 0), max(col - factor, 0)
         around = base.cut(top, left, (row + window.rows + factor - top, col + window.cols + factor - left))
-        if not around.fours.any():
-            continue
         inner = np.s_[row - top : row - top + window.rows, col - left : col - left + window.cols]
         coarse = np.s_[
             row // factor : -(-(row + window.rows) // factor), col // factor : -(-(col + window.cols) // factor)
         ]
-        for band in range(bands):
-            layer = np.ascontiguousarray(around.band(band))
-            if not layer.any():
+        for at, four in enumerate(around.fours):
+            if not four.any():
                 continue
-            own = layer[inner]
-            plain.band(band)[coarse] = _averaged(own, factor)
-            if band < bands - 1:  # the last one says where the map is known
-                spread = np.asarray(cv2.dilate(layer, kernel), dtype=np.uint8)[inner]
-                grown.band(band)[coarse] = _averaged(spread, factor)
-                before[band] += own.sum(dtype=np.float64)
-                after[band] += spread.sum(dtype=np.float64)
-    shares = before / np.maximum(after, 1.0)
-    shares[-1] = 1.0
-    thin = is_thin(shares)
-    for at in np.flatnonzero(thin).tolist():
+            own, spread = four[inner], dilated(four, kernel)[inner]
+            plain.fours[at][coarse], grown.fours[at][coarse] = averaged(own, factor), averaged(spread, factor)
+            before[at] += cv2.sumElems(own)
+            after[at] += cv2.sumElems(spread)
+    thinner = thinner_of(before.ravel()[:bands], after.ravel()[:bands])
+    for at in np.flatnonzero(thinner < 1).tolist():
         for rows in _stripes(shape[0]):
             plain.band(at)[rows] = grown.band(at)[rows]
     del grown
     (folder / "grown.npy").unlink()
-    return np.where(thin, shares, 1.0)
-
-
-def _averaged(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    rows, cols = (-(-side // factor) for side in layer.shape)
-    padded = np.pad(layer, ((0, -layer.shape[0] % factor), (0, -layer.shape[1] % factor)))
-    return np.asarray(cv2.resize(padded, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return thinner
 
 
 def _stripes(rows: int) -> Iterator[slice]:

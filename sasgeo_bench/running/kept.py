@@ -15,7 +15,6 @@ import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Final
 
@@ -33,7 +32,6 @@ MOST_MB: Final = 4000
 LEAST_CELLS: Final = 2048**2  # of a map: a smaller one is made in less time than a process takes to start
 ABOUT: Final = "kept.json"  # written last: sizes of the other files
 _MAKER: Final = "sasgeo_bench.running.keeper"
-_LIBRARIES: Final = ("numpy", "scipy", "opencv-python-headless", "shapely", "rasterio", "pandas", "geopandas")
 
 
 def kept_folder() -> Path:
@@ -174,5 +172,6 @@ def _code() -> str:
 
 @cache
 def _versions() -> list[str]:
-    versions = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
-    return [*versions, platform.python_version(), platform.machine(), platform.node()]
+    """Return names and versions of all that is installed, as its folders are called, and of Python and the computer."""
+    installed = {path.name for entry in sys.path if entry for path in Path(entry).glob("*-info")}
+    return [*sorted(installed), platform.python_version(), platform.machine(), platform.node()]

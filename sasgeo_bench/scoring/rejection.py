@@ -5,10 +5,11 @@ A matcher's own confidence is treated as a rejector that needs no fit.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
 import numpy as np
@@ -37,6 +38,7 @@ from sasgeo_bench.scoring.decisions import (
 )
 from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, REJECTOR, TRACK, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, seed_of_text
+from sasgeo_bench.scoring.kept_rejection import Judgement, KeptJudgements
 from sasgeo_bench.scoring.metrics import THRESHOLDS
 from sasgeo_bench.scoring.rejection_rows import (
     SLOW_DRAWS,
@@ -185,11 +187,15 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """A rejector to fit: its card, a function that makes a new one, and the split that names calibration places."""
+    """A rejector to fit: its card, a function that makes a new one, and the split that names calibration places.
+
+    `code` is its module:Class, where that is known.
+    """
 
     card: RejectorCard
     make: Make
     split: Split
+    code: str = ""
 
 
 def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
@@ -203,14 +209,15 @@ def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
         if split is None:
             raise ConfigError("rejectors are fitted on the calibration places of a split: name one with --split")
         make = rejector_maker(spec)
-        card = make().card
+        rejector = make()
+        card, kind = rejector.card, type(rejector)
         if named.setdefault(card.name, spec) != spec:
             raise ConfigError(
                 f"{named[card.name]} and {spec} are both named {card.name!r}: rename one, or leave it out"
             )
         if card.name == OWN:
             raise ConfigError(f"{spec}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector")
-        found[card.name] = Rule(card=card, make=make, split=split)
+        found[card.name] = Rule(card=card, make=make, split=split, code=f"{kind.__module__}:{kind.__qualname__}")
     return found
 
 
@@ -474,6 +481,7 @@ class RejectionTask:
     """Answers of one entry to evaluate with rejectors, by name; its own confidence is always added.
 
     `split` assigns calibration places. `is_taught` is True if the entry was trained on other places of the split.
+    Results are kept in the folder `kept`, and taken from there, where one is named.
     """
 
     matcher: str
@@ -482,6 +490,7 @@ class RejectionTask:
     rules: Mapping[str, Rule]
     split: Split | None
     is_taught: bool
+    kept: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -543,13 +552,37 @@ def evaluate_rejectors(
     return RejectionResult(judged=judged, rows=rows, acceptance=acceptance, remarks=tuple(remarks))
 
 
-def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception]:
-    """Return by rejector rows of `judge`, of the board and of acceptance, or the error; own confidence comes first."""
-    own = _tried(partial(own_confidence, task.scores, task.split, is_taught=task.is_taught))
-    found = {OWN: own, **_judged_by_all(task)}  # of the answers none is in memory any more
+def _evaluated(task: RejectionTask) -> dict[str, Judgement | Exception]:
+    """Return what each rejector makes of the answers, or the error; own confidence comes first."""
+    codes = {OWN: __name__, **{name: rule.code for name, rule in task.rules.items()}}
+    kept = None if task.kept is None else _kept(task, task.kept)
+    known = {name: old for name, code in codes.items() if kept and (old := kept.read(name, code)) is not None}
+    new = _new(replace(task, rules={name: rule for name, rule in task.rules.items() if name not in known}), known)
+    for name, found in new.items():
+        if kept and isinstance(found, Judgement):
+            kept.write(name, codes[name], found)
+    return {name: known[name] if name in known else new[name] for name in codes}
+
+
+def _kept(task: RejectionTask, folder: Path) -> KeptJudgements:
+    return KeptJudgements.of(
+        folder,
+        matcher=task.matcher,
+        scores=task.scores,
+        answers=task.predictions,
+        split=task.split,
+        is_taught=task.is_taught,
+    )
+
+
+def _new(task: RejectionTask, known: Collection[str]) -> dict[str, Judgement | Exception]:
+    """Return what is not known yet: of a matcher's own confidence, and of the rejectors of a task."""
+    own = {OWN: partial(own_confidence, task.scores, task.split, is_taught=task.is_taught)}
+    frames = {name: _tried(work) for name, work in own.items() if name not in known}
+    frames |= _judged_by_all(task)  # of the answers none is in memory any more
     return {
         name: frame if isinstance(frame, Exception) else _tried(partial(_with_figures, task, name, frame))
-        for name, frame in found.items()
+        for name, frame in frames.items()
     }
 
 
@@ -584,13 +617,11 @@ def _joined(parts: Sequence[pd.DataFrame | Exception]) -> pd.DataFrame:
     return frames[0] if len(frames) == 1 else pd.concat(frames, ignore_index=True)
 
 
-def _with_figures(
-    task: RejectionTask, name: str, frame: pd.DataFrame
-) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+def _with_figures(task: RejectionTask, name: str, frame: pd.DataFrame) -> Judgement:
     """Return rows of `judge` with those of the board and of acceptance."""
     is_calibrated = name == OWN or task.rules[name].card.is_calibrated  # own confidence counts as a probability
     figures = FIGURE_SCHEMA.frame(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated))
-    return frame, figures, acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])
+    return Judgement(frame, figures, acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0]))
 
 
 def _tried(work: Callable[[], Found]) -> Found | Exception:

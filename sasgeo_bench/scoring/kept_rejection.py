@@ -57,15 +57,17 @@ class KeptJudgements:
     def of(
         cls,
         folder: Path,
-        *,
         matcher: str,
         scores: pd.DataFrame,
         answers: StoredAnswers,
         split: Split | None,
-        **more: bool,
-    ) -> Self:
-        """Return those of an entry's scored rows, all its answers, the split, and what else they follow from."""
-        digest = hashlib.sha256(repr((matcher, split, sorted(more.items()))).encode())
+        *,
+        is_taught: bool,
+    ) -> Self | None:
+        """Return those of an entry's scored rows, all its answers and the split; None while the program changes."""
+        if (programs := _programs()) is None:
+            return None
+        digest = hashlib.sha256(programs + repr((matcher, split, is_taught)).encode())
         for part in _parts(scores, answers):
             digest.update(hashlib.sha256(part).digest())
         return cls(folder=folder, entry=digest.digest(), scores=scores)
@@ -94,21 +96,17 @@ class KeptJudgements:
         if path is None or not self.scores[_ID].is_unique:
             return
         own = found.judged[[_ID, *found.judged.columns.difference(self.scores.columns, sort=False)]]
-        sink = pa.BufferOutputStream()
-        for frame in (own, found.figures, found.acceptance):
-            sink.write(_bytes_of(pa.Table.from_pandas(frame, preserve_index=False), compression="zstd"))
-        data = sink.getvalue()
+        parts = (pa.Table.from_pandas(frame, preserve_index=False) for frame in (own, *found[1:]))
+        data = b"".join(_bytes_of(part, compression="zstd") for part in parts)
         with suppress(OSError, StoreError), fresh_file(path, mend="") as scratch:
             scratch.write_bytes(hashlib.sha256(data).digest() + data)
             _sweep(self.folder)
 
     def _path(self, rejector: str, code: str) -> Path | None:
-        """Return the file of a rejector by its module:Class; None where nobody knows all that it follows from."""
-        module = code.partition(".")[0]
-        if module not in SHIPPED_MODULES or (programs := _programs(module)) is None:
+        """Return the file of a rejector by its module:Class; None of one whose code is not among what was hashed."""
+        if code.partition(".")[0] not in SHIPPED_MODULES:
             return None
-        digest = hashlib.sha256(self.entry + programs + repr((rejector, code)).encode())
-        return self.folder / f"{digest.hexdigest()}{_SUFFIX}"
+        return self.folder / f"{hashlib.sha256(self.entry + repr((rejector, code)).encode()).hexdigest()}{_SUFFIX}"
 
 
 def _parts(scores: pd.DataFrame, answers: StoredAnswers) -> Iterator[pa.Buffer]:
@@ -123,21 +121,26 @@ def _bytes_of(table: pa.Table, *, compression: str | None = None) -> pa.Buffer:
     return sink.getvalue()
 
 
-@cache
-def _programs(module: str) -> bytes | None:
-    """Return the SHA-256 of this package, that of a rejector, Python, all that is installed, and the machine.
+def _programs() -> bytes | None:
+    """Return the SHA-256 of the packages that ship, of Python and all that is installed, and of the machine.
 
-    None if a file has changed since this process began, which may run what it was before.
+    None if a file of theirs has changed since this process began, which may run what it was before.
     """
-    begun = psutil.Process().create_time()
+    roots = [Path(str(sys.modules[name].__file__)).parent for name in SHIPPED_MODULES if name in sys.modules]
+    paths = sorted(path for root in roots for path in root.rglob("*") if path.suffix != ".pyc" and path.is_file())
+    about = tuple((path, path.stat().st_mtime_ns) for path in paths)
+    if max(changed_ns for _, changed_ns in about) >= psutil.Process().create_time() * 1e9:
+        return None
+    return _digest(about)
+
+
+@cache
+def _digest(files: tuple[tuple[Path, int], ...]) -> bytes:
+    """Return the SHA-256 of files as they were at some time, and of what is below them."""
     versions = sorted({(str(one.name), one.version) for one in distributions()})
     digest = hashlib.sha256(repr((sys.version, platform.platform(), versions)).encode())
-    for name in (_OURS, module):
-        root = Path(str(sys.modules[name].__file__)).parent
-        for path in sorted(path for path in root.rglob("*") if path.suffix != ".pyc" and path.is_file()):
-            if path.stat().st_mtime >= begun:
-                return None
-            digest.update(repr(str(path.relative_to(root))).encode() + hashlib.sha256(path.read_bytes()).digest())
+    for path, _ in files:
+        digest.update(repr(str(path)).encode() + hashlib.sha256(path.read_bytes()).digest())
     return digest.digest()
 
 

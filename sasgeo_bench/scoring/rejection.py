@@ -555,7 +555,7 @@ def evaluate_rejectors(
 def _evaluated(task: RejectionTask) -> dict[str, Judgement | Exception]:
     """Return what each rejector makes of the answers, or the error; own confidence comes first."""
     codes = {OWN: __name__, **{name: rule.code for name, rule in task.rules.items()}}
-    kept = None if task.kept is None else _kept(task, task.kept)
+    kept = _kept(task)
     known = {name: old for name, code in codes.items() if kept and (old := kept.read(name, code)) is not None}
     new = _new(replace(task, rules={name: rule for name, rule in task.rules.items() if name not in known}), known)
     for name, found in new.items():
@@ -564,21 +564,19 @@ def _evaluated(task: RejectionTask) -> dict[str, Judgement | Exception]:
     return {name: known[name] if name in known else new[name] for name in codes}
 
 
-def _kept(task: RejectionTask, folder: Path) -> KeptJudgements:
-    return KeptJudgements.of(
-        folder,
-        matcher=task.matcher,
-        scores=task.scores,
-        answers=task.predictions,
-        split=task.split,
-        is_taught=task.is_taught,
-    )
+def _kept(task: RejectionTask) -> KeptJudgements | None:
+    """Return what is kept of an entry; None where nothing is, as where its answers cannot be read."""
+    if task.kept is None:
+        return None
+    of = partial(KeptJudgements.of, task.kept, task.matcher, task.scores, task.predictions, task.split)
+    found = _tried(partial(of, is_taught=task.is_taught))
+    return found if isinstance(found, KeptJudgements) else None
 
 
 def _new(task: RejectionTask, known: Collection[str]) -> dict[str, Judgement | Exception]:
     """Return what is not known yet: of a matcher's own confidence, and of the rejectors of a task."""
-    own = {OWN: partial(own_confidence, task.scores, task.split, is_taught=task.is_taught)}
-    frames = {name: _tried(work) for name, work in own.items() if name not in known}
+    own = partial(own_confidence, task.scores, task.split, is_taught=task.is_taught)
+    frames = {} if OWN in known else {OWN: _tried(own)}
     frames |= _judged_by_all(task)  # of the answers none is in memory any more
     return {
         name: frame if isinstance(frame, Exception) else _tried(partial(_with_figures, task, name, frame))

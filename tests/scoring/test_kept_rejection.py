@@ -23,7 +23,7 @@ NAME = "sasgeo_logistic"
 @pytest.fixture
 def fits(monkeypatch):
     """Return the names of rejectors as they are fitted, on a program that does not change meanwhile."""
-    monkeypatch.setattr(kept_rejection, "_programs", lambda module: module.encode())
+    monkeypatch.setattr(kept_rejection, "_programs", lambda: b"program")
     fitted, judge = [], rejection.judge
 
     def judged(scores, predictions, make, split, *, is_taught):
@@ -115,7 +115,9 @@ def with_column(name, value):
         lambda: {"scores": task(None).scores.assign(more=1.0)},
     ],
 )
-def test_anything_else_that_a_fit_follows_from_is_fitted_anew(tmp_path, fits, change):
+def test_anything_else_that_a_fit_follows_from_is_fitted_anew(tmp_path, fits, change, monkeypatch):
+    monkeypatch.setattr(rejection, "integrity_rows", lambda *_, **__: [])  # they take most of the time
+    monkeypatch.setattr(rejection, "acceptance_frame", lambda *_: rejection.ACCEPTANCE_SCHEMA.empty())
     rejection._evaluated(task(tmp_path))
     changed = task(tmp_path, **change())
     found = rejection._evaluated(changed)
@@ -135,27 +137,43 @@ def test_code_and_libraries_of_other_versions_are_another_program(tmp_path, monk
     path = tmp_path / "sasgeo_like" / "rule.py"
     path.parent.mkdir()
     (path.parent / "__init__.py").touch()
-    path.write_text("limit = 1\n")
 
-    def of_program():
-        kept_rejection._programs.cache_clear()
-        return kept_rejection._programs("sasgeo_like")
+    def of_program(text, name="rule.py", changed_s=1e9):
+        path.unlink(missing_ok=True)
+        path.with_name(name).write_text(text)
+        for one in path.parent.rglob("*.py"):
+            os.utime(one, (changed_s, changed_s))
+        return kept_rejection._programs()
 
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(kept_rejection, "SHIPPED_MODULES", ("sasgeo_like", "sasgeo_none"))
     __import__("sasgeo_like")
-    assert of_program() is None  # it has changed since this process began
-    for one in path.parent.rglob("*.py"):
-        os.utime(one, (1e9, 1e9))
-    before = of_program()
-    assert before == of_program()
-    path.write_text("limit = 2\n")
-    os.utime(path, (1e9, 1e9))
-    after = of_program()
-    path.rename(path.with_name("other.py"))
-    assert len({before, after, of_program()}) == 3
+    before = of_program("limit = 1")
+    assert before == of_program("limit = 1")
+    assert of_program("limit = 2", changed_s=time.time() + 1) is None  # since this process began
+    others = [of_program("limit = 2", changed_s=2e8), of_program("limit = 1", changed_s=3e8, name="other.py")]
     monkeypatch.setattr(kept_rejection, "distributions", list)
-    assert of_program() not in {before, after}
-    kept_rejection._programs.cache_clear()
+    kept_rejection._digest.cache_clear()
+    others.append(kept_rejection._programs())
+    assert len({before, *others}) == 4
+    assert None not in others
+    monkeypatch.setattr(kept_rejection, "_programs", lambda: None)
+    rejection._evaluated(task(tmp_path / "kept"))
+    assert not (tmp_path / "kept").exists()
+
+
+def test_the_packages_that_ship_are_hashed():
+    found = kept_rejection._programs()
+    assert found is None or len(found) == 32  # None to who edits them meanwhile
+    assert {"sasgeo_bench", "sasgeo_baselines"} <= {*kept_rejection.SHIPPED_MODULES}
+
+
+def test_answers_that_cannot_be_read_are_the_fault_that_they_were(tmp_path, fits):
+    unread = task(tmp_path / "kept", predictions=StoredAnswers({}, {}))
+    found = rejection._evaluated(unread)
+    assert isinstance(found[NAME], KeyError)
+    assert isinstance(rejection._evaluated(replace(unread, kept=None))[NAME], KeyError)
+    assert fits == []
 
 
 def test_of_a_rejector_that_does_not_ship_nothing_is_kept(tmp_path, fits):

@@ -29,6 +29,7 @@ from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import METRICS, check_registered, code_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
+from sasgeo_bench.osm.locate import cache_folder
 from sasgeo_bench.regions.region import LICENCE
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.tasks.split import find_split
@@ -144,7 +145,14 @@ def request_of(
     settings, stored = stored_settings(predictions), stored_among(predictions)
     if settings is None or stored is None:
         chosen = find_split(split or "crossfit", folders=folders)
-        return ScoreRequest(predictions=predictions, root=root, split=chosen, rejectors=rejectors, board=board)
+        return ScoreRequest(
+            predictions=predictions,
+            root=root,
+            split=chosen,
+            rejectors=rejectors,
+            board=board,
+            kept_fits=fits_folder(),
+        )
     if not rejectors:
         check_registered(settings.rejectors, source=str(stored))
     name = split or settings.split
@@ -166,7 +174,13 @@ def request_of(
         pipeline=settings.pipeline,
         failed=failed,
         elsewhere=asked_elsewhere(stored),
+        kept_fits=fits_folder(),
     )
+
+
+def fits_folder() -> Path:
+    """Return the folder of the user's cache that keeps what rejectors made of answers; it may be removed."""
+    return cache_folder() / "rejectors"
 
 
 def score_all(request: ScoreRequest, *, has_cases: bool = True, results: Path | None = None) -> Scored:

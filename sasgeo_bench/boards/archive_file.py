@@ -48,6 +48,7 @@ from sasgeo_bench.matching.cards import TrainingRecord
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.running.prediction_files import (
+    RUN,
     RunManifest,
     differing_columns,
     prediction_row,
@@ -620,7 +621,9 @@ def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into:
         manifest, count = _manifest_of(row["about"]), row["rows"]
         run = into / "runs" / _folder_name(_file_of(manifest))
         place = run / _folder_name(manifest.suite) / _folder_name(manifest.region)
-        manifest.save(place)
+        place.mkdir(parents=True, exist_ok=True)
+        # Not by `save`, which waits for the disk: nothing here is to outlive a crash
+        (place / RUN).write_text(json_text(manifest.content()), encoding="utf-8")
         if row[LEARNED] is not None:
             (run / cards.FOLDER).mkdir(exist_ok=True)
             (run / cards.FOLDER / _learned_name(manifest.learned)).write_text(row[LEARNED], encoding="utf-8")

@@ -205,6 +205,7 @@ def _rejection(
             rules=rules,
             split=request.split,
             is_taught=entry.is_taught,
+            kept=request.kept_fits if request.dask is None else None,  # its workers are elsewhere
         )
         for entry in entries
         if entry.name not in known

@@ -43,7 +43,8 @@ class ScoreRequest:
     keeps the version of their maps, their title and their sealed places, and their results on a private seed where no
     private board is named. `sealed` are the sealed places (`private_seed.sealed_record`). `failed` names entries that
     failed before scoring, and why. `stored` is a board whose entries are not fitted again, `elsewhere` rows of other
-    boards that asked the same queries.
+    boards that asked the same queries. What rejectors make of the answers is kept for the next time in the folder
+    `kept_fits`, if there is one (`archive.fits_folder`).
     """
 
     predictions: Sequence[Path]
@@ -74,6 +75,7 @@ class ScoreRequest:
     failed: Mapping[str, str] = field(default_factory=dict)
     stored: Board | None = None
     elsewhere: Sequence[Elsewhere] = ()
+    kept_fits: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

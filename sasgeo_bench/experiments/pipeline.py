@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from sasgeo_bench.boards.archive import pack_board
+from sasgeo_bench.boards.archive import fits_folder, pack_board
 from sasgeo_bench.boards.archive_file import check_results
 from sasgeo_bench.boards.build import drawings, make_board
 from sasgeo_bench.boards.scored import Scored, ScoreRequest
@@ -92,6 +92,7 @@ def run_pipeline(
         private=private,
         sealed=sealed,
         failed=failures.found,
+        kept_fits=fits_folder(),
     )
     more = () if plan.experiment is None else (partial(plan.experiment.extra, root=plan.out),)
     scored = make_board(request, (*drawings(request, has_cases=has_cases), *more))

@@ -492,6 +492,11 @@ class StoredAnswers(Mapping[str, Prediction]):
             if task in asked:
                 yield read().columns()
 
+    def tables(self) -> Iterator[pa.Table]:
+        """Yield all answers, a task at a time."""
+        for read in self._read.values():
+            yield read().table
+
     def of_task(self, task: Path) -> Answers:
         """Return the answers to one task. Raise `StoreError` if they cannot be read."""
         return self._read[task]()

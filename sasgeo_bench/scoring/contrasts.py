@@ -212,7 +212,7 @@ def _at_place(
         found = _area_finding(contrast, *rows)
     else:
         sides = _less_other(contrast, scores, *rows) if contrast.metric in LESS else _sides(contrast, *rows)
-        found = _value_finding(contrast, rows[0][sides.is_counted], sides, draws)
+        found = _value_finding(contrast, rows[0][sides.is_counted], sides, draws, is_tested=False)
     return PlaceDifference(
         place=str(rows[0]["place"].iloc[0]),
         n=found.n,
@@ -334,10 +334,15 @@ def _less_other(
     return _Sides(ours=ours, theirs=theirs, best=best, is_counted=is_counted)
 
 
-def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int) -> Finding:
-    """Return the finding by success or recall on the same queries in the same order, without Holm's adjustment."""
+def mean_finding(
+    contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, draws: int, *, is_tested: bool = True
+) -> Finding:
+    """Return the finding by success or recall on the same queries in the same order, without Holm's adjustment.
+
+    Without `is_tested`, leave out p over places, the interval by countries and what is detectable, which take longest.
+    """
     sides = _sides(contrast, first, second)
-    found = _value_finding(contrast, first[sides.is_counted], sides, draws)
+    found = _value_finding(contrast, first[sides.is_counted], sides, draws, is_tested=is_tested)
     if not found.n:
         return found
     whole = 0.0 if found.is_lower_better else 1.0  # a shared tie is no win
@@ -345,7 +350,7 @@ def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, 
     blocks = first["block"][sides.is_counted].tolist()
     exact, clustered = mcnemar_exact(won[0], won[1]), mcnemar_clustered(won[0], won[1], blocks)
     places = first["place"][sides.is_counted].tolist()
-    is_enough = found.places >= LEAST_PLACES
+    is_enough = is_tested and found.places >= LEAST_PLACES
     return replace(
         found,
         first_only=exact.first_only,
@@ -358,7 +363,9 @@ def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, 
     )
 
 
-def _value_finding(contrast: Contrast, rows: pd.DataFrame, sides: _Sides, draws: int) -> Finding:
+def _value_finding(
+    contrast: Contrast, rows: pd.DataFrame, sides: _Sides, draws: int, *, is_tested: bool = True
+) -> Finding:
     """Return the finding by means of values; `rows` are those of the counted queries."""
     if not len(rows):
         return _nothing(contrast)
@@ -378,11 +385,11 @@ def _value_finding(contrast: Contrast, rows: pd.DataFrame, sides: _Sides, draws:
         difference=float(gaps.mean()),
         first_only=int((gaps > 0).sum()),
         second_only=int((gaps < 0).sum()),
-        p_places=sign_flip(np.bincount(place, weights=gaps).astype(float)),
+        p_places=sign_flip(np.bincount(place, weights=gaps).astype(float)) if is_tested else math.nan,
     )
     varied = (rows.loc[gaps != 0, "place"].nunique(), rows.loc[gaps != 0, "block"].nunique())
     found = _with_ends(found, (means[0][:, 0], means[1][:, 0]), won, drawn.trials, varied)
-    far = _by_country(contrast, rows, draws)
+    far = _by_country(contrast, rows, draws) if is_tested else None
     return _with_countries(found, rows, None if far is None else bootstrap_means(gaps[:, None], far)[:, 0])
 
 

@@ -269,7 +269,7 @@ def _of(contrast: Contrast, scores: Mapping[str, pd.DataFrame], draws: int) -> I
             contrast=contrast.name,
             suite=suite,
             kind=kind,
-            finding=mean_finding(contrast, first[rows], second[rows], draws),
+            finding=mean_finding(contrast, first[rows], second[rows], draws, is_tested=False),
         )
 
 

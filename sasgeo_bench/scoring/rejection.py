@@ -5,14 +5,16 @@ A matcher's own confidence is treated as a rejector that needs no fit.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
-from typing import Annotated, Final, Self, TypeVar
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Annotated, Final, TypeVar
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError, MatchError, counted
 from sasgeo_bench.core.folders import uncollected
@@ -36,6 +38,7 @@ from sasgeo_bench.scoring.decisions import (
 )
 from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, REJECTOR, TRACK, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, seed_of_text
+from sasgeo_bench.scoring.kept_rejection import Judgement, KeptJudgements
 from sasgeo_bench.scoring.metrics import THRESHOLDS
 from sasgeo_bench.scoring.rejection_rows import (
     SLOW_DRAWS,
@@ -184,11 +187,15 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """A rejector to fit: its card, a function that makes a new one, and the split that names calibration places."""
+    """A rejector to fit: its card, a function that makes a new one, and the split that names calibration places.
+
+    `code` is its module:Class, where that is known.
+    """
 
     card: RejectorCard
     make: Make
     split: Split
+    code: str = ""
 
 
 def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
@@ -202,14 +209,15 @@ def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
         if split is None:
             raise ConfigError("rejectors are fitted on the calibration places of a split: name one with --split")
         make = rejector_maker(spec)
-        card = make().card
+        rejector = make()
+        card, kind = rejector.card, type(rejector)
         if named.setdefault(card.name, spec) != spec:
             raise ConfigError(
                 f"{named[card.name]} and {spec} are both named {card.name!r}: rename one, or leave it out"
             )
         if card.name == OWN:
             raise ConfigError(f"{spec}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector")
-        found[card.name] = Rule(card=card, make=make, split=split)
+        found[card.name] = Rule(card=card, make=make, split=split, code=f"{kind.__module__}:{kind.__qualname__}")
     return found
 
 
@@ -284,21 +292,22 @@ def judge(
     is_judged = np.zeros(len(usable), dtype=bool)
     for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
         group = needed.iloc[rows]
-        answers = {name: predictions[name] for name in group["query_id"][group["is_answered"].to_numpy(bool)]}
+        fits = _Fits(rows=group, answers=_answers_to(group, predictions), make=make)
         for alike in _by_calibration(turns(group, split, is_taught=is_taught)):
-            test, calibration = alike.test, group[alike.turns[0].calibration]
-            if not test.any() or not calibration["is_answered"].any():
+            test, calibration = alike.test, alike.turns[0].calibration
+            if not test.any() or not (calibration & fits.is_answered).any():
                 continue
-            fit = _Fit.of(calibration, answers, make)
+            rejector = fits.on(calibration)
             for turn in alike.turns:
-                p_false, remark = _apply(fit.rejector, group[turn.test], answers)
+                p_false, remark = fits.applied(rejector, turn.test)
                 found = {"p_right": 1.0 - p_false, "remark": remark, "is_own_calibration": turn.is_own}
                 for name, values in found.items():
                     columns[name][rows[turn.test]] = values
             is_judged[rows[test]] = True
-            columns["is_calibrated"][rows[test]] = fit.rejector.card.is_calibrated
+            columns["is_calibrated"][rows[test]] = rejector.card.is_calibrated
+            known = group[calibration].assign(p_right=1.0 - fits.held_back(calibration))
             asked = group[test].assign(p_right=columns["p_right"][rows[test]])
-            for name, values in _decided(fit.known, asked).items():
+            for name, values in _decided(known, asked).items():
                 columns[name][rows[test]] = values
     return some_rows(usable.assign(**columns), is_judged)
 
@@ -359,22 +368,6 @@ def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taugh
     return some_rows(usable.assign(p_right=p_right, **accepted), is_given)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Fit:
-    """A rejector fitted on calibration places, and these with their own `p_right`, each from a fit on others."""
-
-    rejector: Rejector
-    known: pd.DataFrame
-
-    @classmethod
-    def of(cls, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make) -> Self:
-        """Fit on calibration places, and on parts of them."""
-        rejector = _fitted(make, calibration, predictions)
-        return cls(
-            rejector=rejector, known=calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
-        )
-
-
 _NAMES: Final = ("query_id", "place", "part", "country", "block")  # of objects, which are chosen faster than texts
 _NEEDED: Final = (*_NAMES, "is_answered", "is_right", "is_present")
 # What is decided about rows from the calibration places: acceptance by each threshold, chances at each declared share.
@@ -406,44 +399,62 @@ def _are_chances(answers: Fixes) -> bool:
     return bool(((given >= 0) & (given <= 1)).all())
 
 
-def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
-    """Return probabilities on calibration places, each from a fit on others: a tested place is in no fit, either.
+@dataclass(frozen=True, kw_only=True)
+class _Fits:
+    """Fits of a rejector on some of N rows, by masks of shape (N,); `answers` are those to them, None without one.
 
-    What is left out is a country, as that of a tested place is; of a single country a place, of a single place a block.
-    A single block uses its own fit.
+    One fit serves all that ask for the same rows: what is left out of two calibrations often leaves the same.
     """
-    unit = next((name for name in ("country", "place") if len(set(calibration[name])) > 1), "block")
-    names = sorted(set(calibration[unit]))
-    if len(names) < 2:  # one block cannot be left out
-        return _apply(_fitted(make, calibration, predictions), calibration, predictions)[0]
-    fold = calibration[unit].map({name: at % _PARTS for at, name in enumerate(names)}).to_numpy()
-    found = np.full(len(calibration), np.nan)
-    for part in sorted(set(fold)):
-        rest, mine = calibration[fold != part], calibration[fold == part]
-        if rest["is_answered"].any():
-            found[fold == part] = _apply(_fitted(make, rest, predictions), mine, predictions)[0]
-    return found
 
+    rows: pd.DataFrame
+    answers: NDArray[np.object_]
+    make: Make
+    found: dict[bytes, Rejector] = field(default_factory=dict)
 
-def _fitted(make: Make, known: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Rejector:
-    """Return a new rejector, fitted on the answers of some rows."""
-    rejector = make()
-    answered = known[known["is_answered"].to_numpy(bool)]
-    with _blamed(rejector):
-        rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
-    return rejector
+    @cached_property
+    def is_answered(self) -> Bools:
+        return self.rows["is_answered"].to_numpy(bool)
 
+    def on(self, known: Bools) -> Rejector:
+        """Return a rejector that is fitted on the answers of some rows."""
+        chosen = known & self.is_answered
+        if (rejector := self.found.get(chosen.tobytes())) is None:
+            rejector = self.make()
+            with _blamed(rejector):
+                rejector.fit(self.answers[chosen].tolist(), ~self.rows["is_right"].to_numpy(bool)[chosen])
+            self.found[chosen.tobytes()] = rejector
+        return rejector
 
-def _apply(rejector: Rejector, asked: pd.DataFrame, predictions: Mapping[str, Prediction]) -> tuple[Floats, str]:
-    """Return P(false) of some rows, NaN without an answer, and the rejector's remark on its fit."""
-    found = np.full(len(asked), np.nan)
-    is_answered = asked["is_answered"].to_numpy(bool)
-    some = _answers(asked[is_answered], predictions)
-    with _blamed(rejector):
-        if some:
-            count = len(some)  # whatever becomes of the list
-            found[is_answered] = check_p_false(rejector.p_false(some), count)
-        return found, remark_of(rejector)
+    def applied(self, rejector: Rejector, asked: Bools) -> tuple[Floats, str]:
+        """Return P(false) of some rows, NaN without an answer, and the rejector's remark on its fit."""
+        is_answered = self.is_answered[asked]
+        found = np.full(len(is_answered), np.nan)
+        some = self.answers[asked & self.is_answered].tolist()
+        with _blamed(rejector):
+            if some:
+                count = len(some)  # whatever becomes of the list
+                found[is_answered] = check_p_false(rejector.p_false(some), count)
+            return found, remark_of(rejector)
+
+    def held_back(self, known: Bools) -> Floats:
+        """Return P(false) of calibration rows, each from a fit on others: a tested place is in no fit, either.
+
+        What is left out is a country, as that of a tested place is; of a single country a place, of a single place a
+        block. A single block uses its own fit.
+        """
+        calibration = self.rows[known]
+        unit = next((name for name in ("country", "place") if len(set(calibration[name])) > 1), "block")
+        names = sorted(set(calibration[unit]))
+        if len(names) < 2:  # one block cannot be left out
+            return self.applied(self.on(known), known)[0]
+        fold = np.full(len(known), -1)
+        fold[known] = calibration[unit].map({name: at % _PARTS for at, name in enumerate(names)})
+        found = np.full(len(known), np.nan)
+        for part in range(min(_PARTS, len(names))):
+            rest, mine = known & (fold != part), fold == part
+            if (rest & self.is_answered).any():
+                found[mine] = self.applied(self.on(rest), mine)[0]
+        return found[known]
 
 
 @contextmanager
@@ -457,8 +468,12 @@ def _blamed(rejector: Rejector) -> Iterator[None]:
         ) from error
 
 
-def _answers(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Sequence[Prediction]:
-    return [predictions[name] for name in rows["query_id"]]
+def _answers_to(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> NDArray[np.object_]:
+    """Return the answer to each row, shape (N,); None without one."""
+    found = np.full(len(rows), None, dtype=object)
+    for at, (name, is_answered) in enumerate(zip(rows["query_id"], rows["is_answered"], strict=True)):
+        found[at] = predictions[name] if is_answered else None
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -466,6 +481,7 @@ class RejectionTask:
     """Answers of one entry to evaluate with rejectors, by name; its own confidence is always added.
 
     `split` assigns calibration places. `is_taught` is True if the entry was trained on other places of the split.
+    Results are kept in the folder `kept`, and taken from there, where one is named.
     """
 
     matcher: str
@@ -474,6 +490,7 @@ class RejectionTask:
     rules: Mapping[str, Rule]
     split: Split | None
     is_taught: bool
+    kept: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -535,13 +552,35 @@ def evaluate_rejectors(
     return RejectionResult(judged=judged, rows=rows, acceptance=acceptance, remarks=tuple(remarks))
 
 
-def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception]:
-    """Return by rejector rows of `judge`, of the board and of acceptance, or the error; own confidence comes first."""
-    own = _tried(partial(own_confidence, task.scores, task.split, is_taught=task.is_taught))
-    found = {OWN: own, **_judged_by_all(task)}  # of the answers none is in memory any more
+def _evaluated(task: RejectionTask) -> dict[str, Judgement | Exception]:
+    """Return what each rejector makes of the answers, or the error; own confidence comes first."""
+    codes = {OWN: __name__, **{name: rule.code for name, rule in task.rules.items()}}
+    kept = _kept(task)
+    known = {name: old for name, code in codes.items() if kept and (old := kept.read(name, code)) is not None}
+    new = _new(replace(task, rules={name: rule for name, rule in task.rules.items() if name not in known}), known)
+    for name, found in new.items():
+        if kept and isinstance(found, Judgement):
+            kept.write(name, codes[name], found)
+    return {name: known[name] if name in known else new[name] for name in codes}
+
+
+def _kept(task: RejectionTask) -> KeptJudgements | None:
+    """Return what is kept of an entry; None where nothing is, as where its answers cannot be read."""
+    if task.kept is None:
+        return None
+    of = partial(KeptJudgements.of, task.kept, task.matcher, task.scores, task.predictions, task.split)
+    found = _tried(partial(of, is_taught=task.is_taught))
+    return found if isinstance(found, KeptJudgements) else None
+
+
+def _new(task: RejectionTask, known: Collection[str]) -> dict[str, Judgement | Exception]:
+    """Return what is not known yet: of a matcher's own confidence, and of the rejectors of a task."""
+    own = partial(own_confidence, task.scores, task.split, is_taught=task.is_taught)
+    frames = {} if OWN in known else {OWN: _tried(own)}
+    frames |= _judged_by_all(task)  # of the answers none is in memory any more
     return {
         name: frame if isinstance(frame, Exception) else _tried(partial(_with_figures, task, name, frame))
-        for name, frame in found.items()
+        for name, frame in frames.items()
     }
 
 
@@ -576,13 +615,11 @@ def _joined(parts: Sequence[pd.DataFrame | Exception]) -> pd.DataFrame:
     return frames[0] if len(frames) == 1 else pd.concat(frames, ignore_index=True)
 
 
-def _with_figures(
-    task: RejectionTask, name: str, frame: pd.DataFrame
-) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+def _with_figures(task: RejectionTask, name: str, frame: pd.DataFrame) -> Judgement:
     """Return rows of `judge` with those of the board and of acceptance."""
     is_calibrated = name == OWN or task.rules[name].card.is_calibrated  # own confidence counts as a probability
     figures = FIGURE_SCHEMA.frame(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated))
-    return frame, figures, acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])
+    return Judgement(frame, figures, acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0]))
 
 
 def _tried(work: Callable[[], Found]) -> Found | Exception:

@@ -16,6 +16,7 @@ from sasgeo_bench.scoring.intervals import (
     BoardDraws,
     BoardInterval,
     ClusterDraws,
+    distinct_columns,
     effective_count,
     intervals_of_columns,
     seed_of_text,
@@ -166,5 +167,6 @@ def _drawn_shares(shares: Sequence[Share], drawn: ClusterDraws) -> Floats:
     if not shares or drawn.units_count < 2:  # one place cannot differ from itself
         return np.empty((0, len(shares)))
     columns = [share.counted * share.mass for share in shares] + [share.mass for share in shares]
-    top, bottom = np.hsplit(np.vstack(list(drawn.sums(np.column_stack(columns)))), 2)
+    table, code = distinct_columns(np.column_stack(columns))  # masses are shared
+    top, bottom = np.hsplit(np.vstack(list(drawn.sums(table)))[:, code], 2)
     return np.asarray(np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0))

@@ -22,6 +22,8 @@ from sasgeo_bench.scoring.intervals import (
     BoardDraws,
     BoardInterval,
     amount_interval,
+    distinct_columns,
+    percentile_ends,
     seed_of_text,
     widest_intervals,
     wilson_ends,
@@ -231,10 +233,14 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
     drawn = BoardDraws.of(*names, seed=cell.seed, draws=cell.draws)
     means_of_all = [column.mean() for column in table.T[: len(metrics) * count]]
     figures = np.array(means_of_all + [item.quantile.share for item in below])
+    distinct, code = distinct_columns(table)
+    by_place, by_block = drawn.means(distinct)
     means = _Means(
         figures=figures,
         table=table,
-        drawn=drawn.means(table),
+        drawn=(by_place, by_block),
+        ends=(np.transpose(percentile_ends(by_place)), np.transpose(percentile_ends(by_block))),
+        code=code,
         exact=wilson_ends(figures, drawn.trials),
         clusters=drawn.by_block.units_count,
     )
@@ -250,31 +256,34 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
 class _Means:
     """Columns of values, shape (N, M), with the means that rows state, shape (M,), and the ends of Wilson's intervals.
 
-    `drawn` are their means in draws by places and by blocks, shape (D, M).
+    `drawn` are the means of K distinct columns in draws by places and by blocks, shape (D, K), and `ends` their
+    percentiles, shape (K, 2); `code` is the distinct column that each column is.
     """
 
     figures: Floats
     table: Floats
     drawn: tuple[Floats, Floats]
+    ends: tuple[Floats, Floats]
+    code: Ints
     exact: Floats
     clusters: int
 
     def some(self, columns: slice) -> Self:
         """Return some columns."""
-        by_place, by_block = (means[:, columns] for means in self.drawn)
         return replace(
             self,
             figures=self.figures[columns],
             table=self.table[:, columns],
-            drawn=(by_place, by_block),
+            code=self.code[columns],
             exact=self.exact[columns],
         )
 
     def intervals(self, *, is_share: bool = True) -> list[BoardInterval]:
         """Return the intervals of the means of all columns; values of a share lie in [0, 1]."""
         if is_share:
-            return widest_intervals(self.figures, self.drawn, self.exact)
-        both = zip(*(means.T for means in self.drawn), strict=True)
+            by_place, by_block = (ends[self.code] for ends in self.ends)
+            return widest_intervals(self.figures, (by_place, by_block), self.exact)
+        both = zip(*(means.T[self.code] for means in self.drawn), strict=True)
         pairs = zip(self.figures.tolist(), both, strict=True)
         return [amount_interval(figure, one, self.clusters) for figure, one in pairs]
 
@@ -318,7 +327,7 @@ def _ranked(cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, means: _Mea
     is_share = metric.bounds == (0.0, 1.0)
     found = means.intervals(is_share=is_share)
     is_decidable = metric.is_primary and keys[0].places >= LEAST_PLACES
-    ranks = _ranks(cell.group, means.figures.tolist(), means.drawn[0], metric) if is_decidable else {}
+    ranks = _ranks(cell.group, means.figures.tolist(), means.drawn[0][:, means.code], metric) if is_decidable else {}
     for at, name in enumerate(names):
         rank = ranks.get(name)
         detectable = _detectable(name, cell.group, table, places) if is_decidable else math.nan

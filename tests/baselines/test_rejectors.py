@@ -317,6 +317,23 @@ def test_the_slope_is_the_one_that_best_tells_false_fixes_of_calibration():
     assert "one kind" in rejector.remark
 
 
+def test_spreads_of_many_answers_are_those_of_each_by_itself():
+    """Answers of one to twelve candidates; weights, mean place and variance in plain numpy, one by one."""
+    rng, slope, expected = np.random.default_rng(0), 3.0, []
+    some = [answer(*rng.random(count), step_m=float(rng.uniform(1.0, 200.0))) for count in rng.integers(1, 13, 40)]
+    rejector = Sue()
+    rejector._slope = slope
+    for item in some:
+        first = item.candidates[:10]
+        weights = np.exp(slope * np.array([score for _, score in first]))
+        places = np.array([(pose.easting_m, pose.northing_m) for pose, _ in first])
+        away = np.minimum(np.abs(places - np.average(places, axis=0, weights=weights)), 500.0)
+        variance = np.average(away**2, axis=0, weights=weights).mean()
+        expected.append(0.5 if len(first) == 1 else variance / (variance + 25.0**2))
+    assert rejector.p_false(some) == pytest.approx(expected)
+    assert rejector.p_false(some[::-1]).tolist() == rejector.p_false(some)[::-1].tolist()
+
+
 def test_how_far_the_first_stands_out_by_hand():
     """The others have mean 2 and deviation 1: a lead of 4 is four deviations."""
     assert doubt(SimilarityDistribution, answer(6.0, 3.0, 1.0), answer(6.0, 3.0)) == pytest.approx([1 / 6, 1 / 2])

@@ -28,6 +28,7 @@ from sasgeo_bench.core.parquet import read_frame
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.scoring import kept_rejection, rejection
 from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.tasks.query import base_of
@@ -89,6 +90,22 @@ def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path
     first, again = plan.out / "boards" / "kept", tmp_path / "boards" / "again"
     there = contents_of(first)
     assert contents_of(again) == {name: data for name, data in there.items() if name.parts[0] != "pictures"}
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_scored_once_more_no_rejector_is_fitted_and_the_board_is_the_same(kept, program, tmp_path, monkeypatch):
+    _, _, folder, _ = kept
+    monkeypatch.setattr(kept_rejection, "_programs", lambda: b"program")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    fitted, judge = [], rejection.judge
+    monkeypatch.setattr(rejection, "judge", lambda *given, **more: fitted.append(given) or judge(*given, **more))
+    for name in ("once", "twice"):
+        assert program("score", "--predictions", folder, "--name", name, "--out", tmp_path)[0] == 4
+        assert fitted, "the board has rejectors"
+        fitted.append(name)
+    assert fitted[-2:] == ["once", "twice"]  # nothing between both
+    once, twice = (contents_of(tmp_path / "boards" / name) for name in ("once", "twice"))
+    assert once == twice
 
 
 @pytest.mark.slow

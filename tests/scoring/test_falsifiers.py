@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Falsifiers: where the stress is taken away the arms of a contrast should not differ, and if they do it is told."""
 
+from dataclasses import replace
+
 import numpy as np
+import pandas as pd
 import pytest
 
 from sasgeo_bench.boards.board_tables import falsifier_table
 from sasgeo_bench.core.errors import ConfigError
-from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.contrasts import Contrast, mean_finding
 from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, evaluate_falsifiers
 from tests.scoring.test_tables import scores
 
@@ -57,6 +60,18 @@ def test_a_gain_without_the_stress_is_told():
     assert found["control"].verdict == "no gain shown"
     lost = {item.kind: item for item in held(worse, better)}
     assert lost["none"].verdict == "loss without the stress"
+
+
+def test_what_is_told_of_them_is_what_a_contrast_on_the_same_rows_would_tell():
+    worse = right(0.5)
+    better = np.where(KINDS == "none", 1.0, worse)
+    both = [table(errors, roles=ROLES, kinds=KINDS) for errors in (better, worse)]
+    for item in held(better, worse)[1:]:
+        tested = mean_finding(CONTRAST, *(rows[rows["kind"] == item.kind] for rows in both), 400)
+        assert np.isfinite(tested.p_places)
+        told, expected = (FALSIFIER_SCHEMA.frame([replace(item, finding=one)]) for one in (item.finding, tested))
+        pd.testing.assert_frame_equal(told, expected, check_exact=True)
+        assert item.finding.countries == tested.countries
 
 
 def test_views_that_are_all_unknown_and_absent_places_do_not_count():

@@ -147,21 +147,28 @@ def test_thresholds_of_a_split_are_chosen_on_other_places():
     assert "coverage_at_risk_0.05" not in pooled(one_place, split_of("crossfit"))
 
 
-def test_a_threshold_is_set_on_countries_that_its_fit_has_not_seen(monkeypatch):
-    def applied(rest, mine, predictions):  # noqa: ARG001
-        seen.append((set(rest["country"]), set(mine["country"])))
-        return np.full(len(mine), 0.5), ""
+def fitted_by(rejectors):
+    """Return what each of some rejectors was fitted on, and asked."""
+    return [(sorted(set(one.fitted)), sorted(set(one.asked))) for one in rejectors]
 
-    seen = []
-    monkeypatch.setattr(rejection, "_fitted", lambda make, rest, predictions: rest)  # noqa: ARG005
-    monkeypatch.setattr(rejection, "_apply", applied)
+
+def test_a_threshold_is_set_on_countries_that_its_fit_has_not_seen():
+    def fits_on(table):
+        made = []
+        fits = rejection._Fits(rows=table, answers=table["place"].to_numpy(object), make=lambda: Heard(made))
+        assert (fits.held_back(table["part"].to_numpy() == "calibration") == 0.5).all()
+        return fitted_by(made)
+
     places = [f"place{at % 4}" for at in range(120)]
-    table = scores(ERRORS).assign(place=places, country=[f"land{at % 2}" for at in range(120)])
-    assert (rejection._held_back(None, table, {}) == 0.5).all()
-    assert seen == [({"land1"}, {"land0"}), ({"land0"}, {"land1"})]
-    seen.clear()
-    rejection._held_back(None, table.assign(country="land0"), {})
-    assert len(seen) == 4  # of one country, places are left out
+    part = np.where(np.arange(120) < 100, "calibration", "test")
+    table = scores(ERRORS).assign(place=places, country=[f"land{at % 2}" for at in range(120)], part=part)
+    lands = [["place1", "place3"], ["place0", "place2"]]
+    assert fits_on(table) == [(lands[0], lands[1]), (lands[1], lands[0])]
+    every = [f"place{at}" for at in range(4)]
+    assert fits_on(table.assign(country="land0")) == [([name for name in every if name != one], [one]) for one in every]
+    one_place = table.assign(country="land0", place="place0", block=[f"b{at % 2}" for at in range(120)])
+    assert fits_on(one_place) == [(["place0"], ["place0"])] * 2
+    assert fits_on(one_place.assign(block="b0")) == [(["place0"], ["place0"])]
 
 
 def split_of_countries():
@@ -226,30 +233,62 @@ def test_answers_are_read_once_for_all_rejectors_and_judged_as_one_by_one():
     assert all(isinstance(error, KeyError) for error in unread.values())
 
 
-def test_turns_with_the_same_calibration_share_their_fit_and_come_out_as_each_by_itself(monkeypatch):
-    def held_back(make, calibration, predictions):
-        fitted.append(sorted(set(calibration["place"])))
-        return plainly(make, calibration, predictions)
+def plainly_fitted(known, answers):
+    """Return a rejector that is fitted on the answers of some rows."""
+    rejector = Score()
+    rejector.fit([answers[name] for name in known["query_id"]], ~known["is_right"].to_numpy(bool))
+    return rejector
 
+
+def plainly_judged(turn, table, answers):
+    """Return what a turn says of its rows by itself, each fit made anew: `p_right`, and what is decided."""
+    known, asked = table[turn.calibration], table[turn.test]
+    p_right = 1.0 - plainly_fitted(known, answers).p_false([answers[name] for name in asked["query_id"]])
+    unit = "place" if len(set(known["place"])) > 1 else "block"  # all are of one country
+    names = sorted(set(known[unit]))
+    held_back = known.assign(p_right=math.nan)
+    for part in range(5):
+        mine = known[unit].isin(names[part::5])
+        if mine.any():
+            found = plainly_fitted(known[~mine], answers).p_false([answers[name] for name in known[mine]["query_id"]])
+            held_back.loc[mine, "p_right"] = 1.0 - found
+    return p_right, rejection._decided(held_back, asked.assign(p_right=p_right))
+
+
+def test_turns_share_fits_on_the_same_rows_and_come_out_as_each_by_itself():
     table, answers = judged_table()
-    split, fitted, plainly = split_of_countries(), [], rejection._held_back
-    monkeypatch.setattr(rejection, "_held_back", held_back)
+    split, made = split_of_countries(), []
+    heard = judge(table, answers, lambda: Heard(made, Score()), split)
+    fitted = [frozenset(item.query_id for item in one.fitted) for one in made]
+    assert len(fitted) == len(set(fitted))  # none is fitted twice on the same rows
     found = judge(table, answers, Score, split)
-    assert sorted(fitted) == [["place0", "place1"], ["place2"], ["place3"], ["place4"]]  # of five turns
+    pd.testing.assert_frame_equal(heard, found)
     assert len(found) == len(table)
     for turn in turns(table, split):
-        rejector, known = Score(), table[turn.calibration]
-        false = ~known["is_right"].to_numpy(bool)
-        rejector.fit([answers[name] for name in known["query_id"]], false)
-        asked = table[turn.test]
-        p_right = 1.0 - rejector.p_false([answers[name] for name in asked["query_id"]])
-        mine = found[found["query_id"].isin(asked["query_id"])]
+        p_right, decided = plainly_judged(turn, table, answers)
+        mine = found[found["query_id"].isin(table[turn.test]["query_id"])]
         assert mine["p_right"].tolist() == p_right.tolist()
-        held_back = known.assign(p_right=1.0 - plainly(Score, known, answers))
-        for name, values in rejection._decided(held_back, asked.assign(p_right=p_right)).items():
+        for name, values in decided.items():
             np.testing.assert_array_equal(mine[name].to_numpy(float), values)
         assert mine["is_own_calibration"].all()
         assert mine["is_calibrated"].all()
+
+
+class Heard:
+    """Keeps what it is fitted on and asked; says 1/2, or what another rejector says."""
+
+    def __init__(self, made, other=None):
+        self.card, self.other, self.asked = Score.card, other, []
+        made.append(self)
+
+    def fit(self, predictions, is_false):
+        self.fitted = predictions
+        if self.other:
+            self.other.fit(predictions, is_false)
+
+    def p_false(self, predictions):
+        self.asked += predictions
+        return self.other.p_false(predictions) if self.other else np.full(len(predictions), 0.5)
 
 
 class Score:

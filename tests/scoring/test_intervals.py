@@ -19,6 +19,7 @@ from sasgeo_bench.scoring.intervals import (
     bootstrap_means,
     bootstrap_statistic,
     difference_interval,
+    distinct_columns,
     effective_count,
     mean_interval,
     percentile_ends,
@@ -356,3 +357,16 @@ def test_places_that_differ_widen_what_their_blocks_make_narrow() -> None:
     assert by_block.std() == pytest.approx(0.079, abs=0.02 * 0.4)  # sqrt(1/4 / 40)
     with pytest.raises(MetricError, match="two places"):
         ClusterDraws(blocks=["a", "a"], places=["p", "q"], seed=1)
+
+
+@given(
+    rows=st.integers(1, 5).flatmap(
+        lambda count: st.lists(st.tuples(*[st.sampled_from([0.0, 0.5, 1.0])] * count), min_size=1, max_size=9)
+    )
+)
+def test_distinct_columns_are_each_once_and_make_up_the_table(rows) -> None:
+    table = np.array(rows)
+    columns, code = distinct_columns(table)
+    np.testing.assert_array_equal(columns[:, code], table)
+    assert len({*map(tuple, columns.T)}) == columns.shape[1]
+    assert sorted({*code.tolist()}) == list(range(columns.shape[1]))

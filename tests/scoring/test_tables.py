@@ -14,6 +14,7 @@ from sasgeo_bench.boards.tables import text_of
 from sasgeo_bench.boards.text import MARKDOWN, Contents, board_latex, board_markdown, rows_of, warnings_of
 from sasgeo_bench.core.errors import MetricError
 from sasgeo_bench.core.texts import markdown
+from sasgeo_bench.scoring import tables as of_tables
 from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, evaluate_contrasts
 from sasgeo_bench.scoring.controls import Verdict
@@ -220,6 +221,18 @@ def test_ranks_tell_apart_what_differs_and_nothing_else():
     }
     assert ranks(pick(board, "oracle_pose", "success_25m")) == (None, None)
     assert 0 < pick(board, "good", "success_25m")["detectable"] < 0.2
+
+
+def test_equal_columns_are_drawn_once_and_come_out_as_drawn_each(monkeypatch):
+    chance = np.random.default_rng(5)
+    errors = {name: np.where(chance.random(240) < share, 1.0, 99.0) for name, share in (("one", 0.8), ("other", 0.4))}
+    errors |= {"same": errors["one"], "none": np.full(240, np.inf)}
+    tables = {name: scores(column, blocks=12) for name, column in errors.items()}
+    found = leaderboard(tables, draws=400)
+    monkeypatch.setattr(of_tables, "distinct_columns", lambda table: (table, np.arange(table.shape[1])))
+    pd.testing.assert_frame_equal(found, leaderboard(tables, draws=400), rtol=1e-12)
+    one, same = (found[found["matcher"] == name].drop(columns="matcher") for name in ("one", "same"))
+    pd.testing.assert_frame_equal(one.reset_index(drop=True), same.reset_index(drop=True), check_exact=True)
 
 
 def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():

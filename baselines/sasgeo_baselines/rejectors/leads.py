@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -91,17 +92,36 @@ def scores_of(prediction: Prediction) -> Values:
     return np.clip(np.array([score for _, score in prediction.candidates], dtype=np.float64), -MOST, MOST)
 
 
-def spread_m2(prediction: Prediction, *, slope: float, most: int, far_m: float) -> float:
-    """Return the variance along an axis of the places of the first candidates, m2; it is the mean of both axes.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Firsts:
+    """The first K candidates of N of the answers, `at`: places in m, shape (N, K, 2), and scores, shape (N, K)."""
 
-    A weight is the exponential of `slope` times the score; an offset from the mean place counts as `far_m` at most.
-    """
-    places_m = np.array([_place(pose) for pose, _ in prediction.candidates[:most]])
-    scores = scores_of(prediction)[:most]
-    weights = np.exp(slope * (scores - scores.max()))
-    shares = weights / weights.sum()
-    away_m = np.abs(places_m - shares @ places_m)
-    return float((shares @ np.square(np.minimum(away_m, far_m))).mean())
+    at: NDArray[np.int64]
+    places_m: Values
+    scores: Values
+
+    @classmethod
+    def of(cls, answers: Sequence[Prediction], most: int) -> "list[Firsts]":
+        """Return the first candidates, at most so many, of answers with as many of them."""
+        counts = np.array([min(len(item.candidates), most) for item in answers], dtype=np.int64)
+        found = []
+        for count in np.unique(counts).tolist():
+            at = np.flatnonzero(counts == count)
+            listed = [answers[index].candidates[:count] for index in at.tolist()]
+            places_m = np.array([[_place(pose) for pose, _ in one] for one in listed]).reshape(-1, count, 2)
+            scores = np.array([[score for _, score in one] for one in listed], dtype=np.float64)
+            found.append(cls(at=at, places_m=places_m, scores=np.clip(scores, -MOST, MOST)))
+        return found
+
+    def spreads_m2(self, *, slope: float, far_m: float) -> Values:
+        """Return the variance along an axis of the places, m2, shape (N,); it is the mean of both axes.
+
+        A weight is the exponential of `slope` times the score; an offset from the mean place counts as `far_m` at most.
+        """
+        weights = np.exp(slope * (self.scores - self.scores.max(axis=1, keepdims=True)))
+        shares = (weights / weights.sum(axis=1, keepdims=True))[:, None]
+        away_m = np.abs(self.places_m - shares @ self.places_m)
+        return np.asarray((shares @ np.square(np.minimum(away_m, far_m)))[:, 0].mean(axis=1))
 
 
 def _place(pose: Pose) -> tuple[float, float]:

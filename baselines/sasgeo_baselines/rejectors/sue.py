@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score  # type: ignore[import-untyped, unused-ignore]
 
-from sasgeo_baselines.rejectors.leads import APART_M, answered, scores_of, spread_m2, with_withheld
+from sasgeo_baselines.rejectors.leads import APART_M, Firsts, answered, with_withheld
 from sasgeo_bench import Prediction, RejectorCard
 
 MOST: Final = 10  # candidates, as in the source
@@ -52,15 +52,15 @@ class Sue:
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
         """Choose the slope."""
         at = answered(predictions)
-        answers = [predictions[index] for index in at]
+        firsts = Firsts.of([predictions[index] for index in at], MOST)
         truth = np.asarray(is_false, dtype=bool)[at]
-        unit = _usual_spread(answers)
+        unit = _usual_spread(firsts)
         self.remark = ""
         if truth.all() or not truth.any():
             self._slope = UNTAUGHT / unit
             self.remark = f"answers of calibration are of one kind only: the slope is {UNTAUGHT:g}, not chosen"
             return
-        areas = [roc_auc_score(truth, [_doubt(item, slope / unit) for item in answers]) for slope in SLOPES]
+        areas = [roc_auc_score(truth, _doubts(firsts, slope / unit)) for slope in SLOPES]
         self._slope = SLOPES[int(np.argmax(areas))] / unit
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
@@ -68,19 +68,21 @@ class Sue:
         slope = self._slope
         if slope is None:
             raise RuntimeError(f"{self.card.name}: call fit() with answers of calibration blocks before p_false()")
-        return with_withheld(predictions, lambda answers: np.array([_doubt(item, slope) for item in answers]))
+        return with_withheld(predictions, lambda answers: _doubts(Firsts.of(answers, MOST), slope))
 
 
-def _usual_spread(answers: Sequence[Prediction]) -> float:
+def _usual_spread(firsts: Sequence[Firsts]) -> float:
     """Return the median of the standard deviations of the first scores, of answers with any; 1 if none has."""
-    spreads = np.array([scores_of(item)[:MOST].std() for item in answers])
+    spreads = np.concatenate([np.empty(0), *(some.scores.std(axis=1) for some in firsts)])
     some = spreads[spreads > 1e-150]  # a smaller spread is none, so that quotients stay finite
     return float(np.median(some)) if len(some) else 1.0
 
 
-def _doubt(item: Prediction, slope: float) -> float:
-    if len(item.candidates) == 1:
-        return 1 / 2
-    # 500 m: as in the source: what is further away counts as that far
-    variance_m2 = spread_m2(item, slope=slope, most=MOST, far_m=500.0)
-    return variance_m2 / (variance_m2 + APART_M**2)
+def _doubts(firsts: Sequence[Firsts], slope: float) -> NDArray[np.float64]:
+    found = np.empty(sum(len(some.at) for some in firsts))
+    for some in firsts:
+        # 500 m: as in the source: what is further away counts as that far
+        variance_m2 = some.spreads_m2(slope=slope, far_m=500.0)
+        is_alone = some.scores.shape[1] == 1
+        found[some.at] = 1 / 2 if is_alone else variance_m2 / (variance_m2 + APART_M**2)
+    return found

@@ -94,8 +94,10 @@ def load_rejector(spec: str) -> "Rejector":
     return rejector_maker(spec)()
 
 
-def rejector_maker(spec: str) -> "Callable[[], Rejector]":
+def rejector_maker(spec: str) -> "partial[Rejector]":
     """Return a function that makes rejectors as `load_rejector` does, but looks up the name once.
+
+    Its last argument is what the name stands for: a class, or a function that makes a rejector.
 
     Raise `MatchError` if there is none of that name, or it cannot be imported.
     """

@@ -217,7 +217,9 @@ def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
             )
         if card.name == OWN:
             raise ConfigError(f"{spec}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector")
-        found[card.name] = Rule(card=card, make=make, split=split, code=f"{kind.__module__}:{kind.__qualname__}")
+        # A function may make something else of a class: its name says nothing of what it does
+        code = f"{kind.__module__}:{kind.__qualname__}" if make.args[-1] is kind else ""
+        found[card.name] = Rule(card=card, make=make, split=split, code=code)
     return found
 
 

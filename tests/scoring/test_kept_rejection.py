@@ -187,6 +187,20 @@ def test_of_a_rejector_that_does_not_ship_nothing_is_kept(tmp_path, fits):
     assert len([*tmp_path.iterdir()]) == 1  # the matcher's own confidence
 
 
+def tuned():
+    """Return a rejector that ships, made otherwise than it ships."""
+    rejector = SasgeoLogistic()
+    rejector.p_false = lambda predictions: np.full(len(predictions), 0.5)
+    return rejector
+
+
+def test_of_a_rejector_that_a_function_makes_nothing_is_kept(tmp_path, fits):
+    rejection._evaluated(task(tmp_path))
+    rules = rules_of([f"{__name__}:tuned"], split_of_countries())
+    assert_same(rejection._evaluated(task(tmp_path, rules=rules)), rejection._evaluated(task(None, rules=rules)))
+    assert fits == [NAME] * 3
+
+
 def test_a_damaged_file_is_computed_anew_and_one_that_nobody_reads_goes(tmp_path, fits):
     some = task(tmp_path)
     plain = rejection._evaluated(some)

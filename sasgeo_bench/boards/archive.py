@@ -2,7 +2,7 @@
 """A board with all it was made of -> stored results, and stored results -> what a board is made of."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from sasgeo_bench.boards.elsewhere import asked_elsewhere
 from sasgeo_bench.boards.manifests import PackManifest
 from sasgeo_bench.boards.private_board import check_public
 from sasgeo_bench.boards.scored import Scored, ScoreRequest
-from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.errors import ConfigError, ExtractError, SasgeoError, StoreError, counted
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import METRICS, check_registered, code_of
 from sasgeo_bench.core.progress import tell
@@ -178,9 +178,14 @@ def request_of(
     )
 
 
-def fits_folder() -> Path:
-    """Return the folder of the user's cache that keeps what rejectors made of answers; it may be removed."""
-    return cache_folder() / "rejectors"
+def fits_folder() -> Path | None:
+    """Return the folder of the user's cache that keeps what rejectors made of answers; None without a cache.
+
+    It may be removed.
+    """
+    with suppress(ExtractError):
+        return cache_folder() / "rejectors"
+    return None
 
 
 def score_all(request: ScoreRequest, *, has_cases: bool = True, results: Path | None = None) -> Scored:

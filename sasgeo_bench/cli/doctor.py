@@ -16,7 +16,7 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table
 from sasgeo_bench.cli.options import ExtractFolders, Out
-from sasgeo_bench.core.errors import ExtractError, named
+from sasgeo_bench.core.errors import ExtractError, StoreError, named
 from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, Extract, answers, extract_folders, find_extract
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running.kept import VARIABLE, kept_folder, most_bytes
@@ -47,9 +47,17 @@ def examine(folders: Sequence[Path], *, out: Path) -> Iterator[tuple[str, str]]:
     is_writable = os.access(root, os.W_OK)
     free_gb = shutil.disk_usage(root).free / 1e9
     yield "output", f"{out.absolute()}, {free_gb:.1f} GB free" + ("" if is_writable else ", NOT WRITABLE")
-    kept_mb = sum(path.stat().st_size for path in kept_folder().glob("*/*/*") if path.is_file()) / 1e6
-    yield "kept of maps", f"{kept_folder()}, {kept_mb:.0f} MB of {most_bytes() / 1e6:.0f} ({VARIABLE})"
+    yield "kept of maps", _kept_words()
     yield from _missing(folders)
+
+
+def _kept_words() -> str:
+    try:
+        folder = kept_folder()
+    except StoreError as error:
+        return f"nothing: {error}"
+    kept_mb = sum(path.stat().st_size for path in folder.glob("*/*/*") if path.is_file()) / 1e6
+    return f"{folder}, {kept_mb:.0f} MB of {most_bytes() / 1e6:.0f} ({VARIABLE})"
 
 
 def _missing(folders: Sequence[Path]) -> Iterator[tuple[str, str]]:

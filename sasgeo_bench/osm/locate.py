@@ -162,8 +162,14 @@ class ClassTable(Document):
 
 def extract_folders(given: Sequence[Path] = ()) -> tuple[Path, ...]:
     """Return the folders to search for extracts, in order: those given, SASGEO_EXTRACTS, the user's cache."""
-    named = [Path(folder) for folder in os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep) if folder]
-    return (*given, *named, cache_folder())
+    found = _named_folders(given)
+    with suppress(ExtractError):  # a user without a home has no cache
+        found.append(cache_folder())
+    return tuple(found)
+
+
+def _named_folders(given: Sequence[Path]) -> list[Path]:
+    return [*given, *map(Path, filter(None, os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep)))]
 
 
 def imagery_folders(given: Sequence[Path] = (), *, extracts: Sequence[Path] = ()) -> tuple[Path, ...]:
@@ -176,7 +182,7 @@ def imagery_folders(given: Sequence[Path] = (), *, extracts: Sequence[Path] = ()
     True
     """
     named = [Path(folder) for folder in os.environ.get(IMAGERY_VARIABLE, "").split(os.pathsep) if folder]
-    return (*given, *named, *(folder.parent / "imagery" for folder in extract_folders(extracts)[:-1]))
+    return (*given, *named, *(folder.parent / "imagery" for folder in _named_folders(extracts)))
 
 
 def named_files(name: str, folders: Sequence[Path], *, has_folders: bool = False) -> list[Path]:
@@ -186,10 +192,13 @@ def named_files(name: str, folders: Sequence[Path], *, has_folders: bool = False
 
 
 def cache_folder() -> Path:
-    """Return the folder of downloaded extracts."""
+    """Return the folder of downloaded extracts; raise `ExtractError` if the user has no cache."""
     import pooch  # noqa: PLC0415 - only downloads need it
 
-    return Path(pooch.os_cache("sasgeo-bench"))
+    try:
+        return Path(pooch.os_cache("sasgeo-bench"))
+    except RuntimeError as error:  # of a user who is only a number, as in containers
+        raise ExtractError("you have no home, and so no cache: name a folder by XDG_CACHE_HOME") from error
 
 
 def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:

@@ -2,6 +2,7 @@
 """The process that makes what is kept of a map (`running.kept`): code of ours alone, no plugin is imported."""
 
 import json
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -10,9 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from sasgeo_bench.core.errors import ConfigError, StoreError
-from sasgeo_bench.core.folders import fresh_folder
 from sasgeo_bench.regions.region_files import read_manifest, read_region
-from sasgeo_bench.running.kept import seal
+from sasgeo_bench.running import kernel
+from sasgeo_bench.running.kept import code_hash, seal
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.raster import store_field
 from sasgeo_bench.search.view import Chart
@@ -45,15 +46,14 @@ MAKERS: Final[Mapping[str, Callable[..., None]]] = {"field": _field, "chart": _c
 
 
 def make(region: Path, into: Path, what: str, settings: Mapping[str, Any], *, digest: str) -> None:
-    """Make a kind of `MAKERS` of a map by some settings, in a new folder, whole or not at all.
+    """Make a kind of `MAKERS` of a map by some settings, in an empty folder, which counts as whole at the end.
 
     `digest` is the `Manifest.digest` of the map. Raise `StoreError` if the map is another one, or damaged.
     """
-    with fresh_folder(into) as scratch:
-        _check(region, digest)
-        MAKERS[what](region, scratch, **settings)
-        _check(region, digest)
-        seal(scratch)
+    _check(region, digest)
+    MAKERS[what](region, into, **settings)
+    _check(region, digest)
+    seal(into)
 
 
 def _check(region: Path, digest: str) -> None:
@@ -63,7 +63,10 @@ def _check(region: Path, digest: str) -> None:
 
 def main() -> None:
     """Make what standard input orders."""
+    kernel.prctl(kernel.PR_SET_PDEATHSIG, signal.SIGKILL)  # whoever ordered it held the lock of the folder
     order = json.loads(sys.stdin.read())
+    if order.pop("code") != code_hash():  # it would lie under the name of what other code makes
+        raise StoreError("the program was changed meanwhile")
     order |= {name: Path(order[name]) for name in ("region", "into")}
     make(**order)
 

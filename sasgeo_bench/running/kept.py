@@ -12,6 +12,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from functools import cache
@@ -21,7 +22,7 @@ from typing import Final
 from pydantic import JsonValue
 
 from sasgeo_bench.core.errors import SasgeoError, StoreError
-from sasgeo_bench.core.folders import locked, remove_tree
+from sasgeo_bench.core.folders import fresh_folder, locked, remove_tree
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.regions.region import Manifest
@@ -32,12 +33,20 @@ MOST_MB: Final = 4000
 LEAST_CELLS: Final = 2048**2  # of a map: a smaller one is made in less time than a process takes to start
 ABOUT: Final = "kept.json"  # written last: sizes of the other files
 _MAKER: Final = "sasgeo_bench.running.keeper"
+_LEFT_S: Final = 86_400  # nothing is made for a day: what is older was left by a process that was killed
 
 
 def kept_folder() -> Path:
-    """Return the folder of all that is kept, in the user's cache (`XDG_CACHE_HOME`); it may be removed at any time."""
-    cache_home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(cache_home, "sasgeo-bench", "maps")
+    """Return the folder of all that is kept, in the user's cache (`XDG_CACHE_HOME`); it may be removed at any time.
+
+    Links are followed. Raise `StoreError` if the user has no cache.
+    """
+    try:
+        named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        cache_home = named if named.is_absolute() else Path.home() / ".cache"
+        return (cache_home / "sasgeo-bench" / "maps").resolve()
+    except (RuntimeError, OSError) as error:  # a user who is only a number, as in containers, or links in a circle
+        raise StoreError(f"you have no cache ({one_line(str(error))}): name a folder by XDG_CACHE_HOME") from error
 
 
 def most_bytes() -> int:
@@ -57,7 +66,7 @@ def shelf_of(region: Path) -> Path | None:
     with suppress(SasgeoError, OSError):
         manifest = read_manifest(region)
         if _is_worth_it(manifest):
-            shelf = kept_folder().resolve() / manifest.digest
+            shelf = kept_folder() / manifest.digest
             shelf.mkdir(mode=0o700, parents=True, exist_ok=True)  # a map may be private
             return shelf
     return None
@@ -87,21 +96,27 @@ def kept_of(
         if shelf is None or manifest.digest != digest:
             return None
         # Settings, the map, all code of ours, the libraries, the processor: whatever the result may follow from
-        about = [what, dict(settings), digest, _code(), _versions()]
+        about = [what, dict(settings), digest, code_hash(), _versions()]
         folder = shelf / hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
         with locked(folder):
             if not _is_whole(folder):
                 remove_tree(folder)
                 _make_room(_bytes_of(manifest))
-                places = {"region": str(region), "into": str(folder)}
-                _make({**places, "what": what, "settings": dict(settings), "digest": digest}, timeout_s)
-                if not _is_whole(folder):
-                    return None
+                with fresh_folder(folder) as scratch:  # cleared by this process, for the other one may be killed
+                    places = {"region": str(region), "into": str(scratch)}
+                    _make({**places, "what": what, "settings": dict(settings), "digest": digest}, timeout_s)
+                    if not _is_whole(scratch):
+                        raise StoreError("it was made in part")
             os.utime(folder / ABOUT)  # what was not asked for longest is removed first
     except (SasgeoError, OSError, subprocess.SubprocessError, ValueError) as error:
-        tell(f"nothing is kept of {region.name} ({one_line(str(error))[:200]})")
+        _tell_once(f"nothing is kept of {region.name} ({one_line(str(error))[:200]})")
         return None
     return folder
+
+
+@cache
+def _tell_once(text: str) -> None:
+    tell(text)
 
 
 def seal(folder: Path) -> None:
@@ -130,21 +145,25 @@ def _is_worth_it(manifest: Manifest) -> bool:
 def _make(order: Mapping[str, JsonValue], timeout_s: float) -> None:
     made = subprocess.run(  # noqa: S603 - our own module, by our own interpreter
         [sys.executable, "-P", "-m", _MAKER],
-        input=json.dumps(order).encode(),
+        input=json.dumps({**order, "code": code_hash()}).encode(),
         capture_output=True,
         timeout=timeout_s,
         check=False,
     )
     if made.returncode:
         last = made.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-        raise StoreError(f"it cannot be made: {last}")
+        raise StoreError(f"it cannot be made: {last or f'exit status {made.returncode}'}")
 
 
 def _make_room(needed: int) -> None:
     """Remove what was not asked for longest, until so many bytes fit; raise `StoreError` if the disk lacks them."""
     root = kept_folder()
+    for left in root.glob("*/.*"):
+        with suppress(OSError):
+            if left.is_dir() and left.stat().st_mtime < time.time() - _LEFT_S:
+                remove_tree(left)
     known: dict[Path, tuple[float, int]] = {}
-    for about in root.glob(f"*/*/{ABOUT}"):
+    for about in root.glob(f"*/[!.]*/{ABOUT}"):
         with suppress(OSError):
             size = sum(path.stat().st_size for path in about.parent.iterdir())
             known[about.parent] = (about.stat().st_mtime, size)
@@ -161,7 +180,7 @@ def _make_room(needed: int) -> None:
 
 
 @cache
-def _code() -> str:
+def code_hash() -> str:
     """Return the SHA-256 of all files of this package: a change in any makes all anew."""
     package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted((*package.rglob("*.py"), *package.rglob("*.toml"))):

@@ -46,7 +46,7 @@ from sasgeo_bench.matching.matcher import (
 from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.failures import LOG, is_disk_error, our_failure
-from sasgeo_bench.running.kept import kept_of, shelf_of
+from sasgeo_bench.running.kept import kept_folder, kept_of, shelf_of
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import LEAN, WATCH_S, Group, MemoryWatch
@@ -418,6 +418,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         found = scan.hidden([*code, *self.reach.readable])
         packed = sorted(shipped_dir("pipelines").glob(f"*{PACKED}"))  # answers; what is installed is not walked
         hidden = [*map(str, (*self.reach.hidden, *packed)), *(path for path in found if not self._is_lesson(path))]
+        hidden += _open_cache(code)
         return sandbox.Policy(
             readable=[str(path) for path in (*code, *self.reach.readable)],
             scratch=scratch,
@@ -483,7 +484,7 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, given the learned text."""
         self._region, self._learned = region, learned
-        place, is_kept = str(region.resolve()), shelf_of(region) is not None
+        place, is_kept = str(region.resolve()), _shelf(region) is not None
         reply = self._ask(
             "prepare",
             timeout_s=self.limits.prepare_s,
@@ -530,7 +531,7 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
 
     def _policy(self, scratch: str) -> sandbox.Policy:
         """Let it read what is kept of its maps, too."""
-        policy, shelves = super()._policy(scratch), filter(None, map(shelf_of, self.reach.readable))
+        policy, shelves = super()._policy(scratch), filter(None, map(_shelf, self.reach.readable))
         return replace(policy, readable=[*policy.readable, *map(str, shelves)])
 
     def _found(self, data: bytes) -> Prediction:
@@ -590,6 +591,20 @@ def _command(channel: int, *, is_sandboxed: bool) -> list[str]:
         return [sys.executable, *_ANSWERS, str(channel)]
     package = str(Path(sasgeo_bench.running.child.__file__).parents[2])
     return [sys.executable, "-I", "-S", "-c", PROGRAM, package, *_ANSWERS, str(channel)]
+
+
+def _shelf(region: Path) -> Path | None:
+    """Return the folder of what is kept of a map; None where others could be read beside it."""
+    return None if _open_cache(_code()) else shelf_of(region)
+
+
+def _open_cache(code: Sequence[Path]) -> list[str]:
+    """Return the user's cache if it lies where plugins read, as where their home is the working folder."""
+    with contextlib.suppress(StoreError):
+        cache = kept_folder().parent  # what rejectors made of answers lies there, too
+        if any(cache.is_relative_to(os.path.realpath(path)) for path in (*map(str, code), *sandbox.SYSTEM)):
+            return [str(cache)]
+    return []
 
 
 def _code() -> list[Path]:

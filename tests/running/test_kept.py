@@ -2,11 +2,16 @@
 """What is kept of a map is what would be made, of this map and these settings; and no plugin can change it."""
 
 import os
+import pwd
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sasgeo_bench.boards.archive import fits_folder
+from sasgeo_bench.cli.doctor import examine
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running import keeper, kept, sandbox
 from sasgeo_bench.running.worker import Limits, Reach, Worker
@@ -113,7 +118,7 @@ def test_what_is_there_is_not_made_again_but_for_another_map_other_settings_or_o
     assert asked(region, "chart", **SETTINGS) == first
     assert len(here) == 1
     others = [asked(region, "chart", **SETTINGS | {"reach_m": 5.0}), asked(region, "graph")]
-    for name in ("_code", "_versions"):
+    for name in ("code_hash", "_versions"):
         monkeypatch.setattr(kept, name, lambda: "changed")
         others.append(asked(region, "chart", **SETTINGS))
     assert len({first, *others}) == len(here) == 5
@@ -190,6 +195,78 @@ def test_without_a_folder_that_can_be_written_nothing_is_kept(place, task, here,
     assert kept.shelf_of(town_of(place, task)) is None
     assert asked(town_of(place, task), "graph") is None
     assert here == []
+
+
+@pytest.mark.parametrize("fault", ["no home", "a circle"])
+def test_without_a_cache_nothing_is_kept(fault, place, task, here, tmp_path, monkeypatch):
+    if fault == "no home":  # as of a user who is only a number, in a container
+        monkeypatch.delenv("XDG_CACHE_HOME")
+        monkeypatch.delenv("HOME")
+        monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)
+    else:
+        (tmp_path / "one").symlink_to("two")
+        (tmp_path / "two").symlink_to("one")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "one"))
+    region = town_of(place, task)
+    assert (kept.shelf_of(region), asked(region, "graph"), here) == (None, None, [])
+    assert replies(place, task, "graph_only")[1].status == "ok"
+    assert (fits_folder() is None) == (fault == "no home")  # that folder is looked up where it is written
+    (words,) = [words for what, words in examine([], out=tmp_path) if what == "kept of maps"]
+    assert fault == "a circle" or words.endswith("name a folder by XDG_CACHE_HOME")
+
+
+@pytest.mark.parametrize("fault", [StoreError("killed"), subprocess.TimeoutExpired("maker", 1.0), None])
+def test_of_what_was_made_in_part_nothing_is_left(fault, place, task, monkeypatch):
+    told = []
+
+    def make(order, _):
+        Path(order["into"], "known.npy").touch()
+        if fault:
+            raise fault
+
+    kept._tell_once.cache_clear()
+    monkeypatch.setattr(kept, "_make", make)
+    monkeypatch.setattr(kept, "tell", told.append)
+    region = town_of(place, task)
+    assert [asked(region, "graph") for _ in range(2)] == [None, None]
+    assert [*kept.shelf_of(region).iterdir()] == []
+    assert len(told) == 1
+
+
+@pytest.mark.usefixtures("here")
+def test_what_a_killed_process_left_goes_in_time(place, task):
+    region = town_of(place, task)
+    folders = [kept.shelf_of(region) / f".{name}.partial" for name in ("old", "new")]
+    for folder in folders:
+        folder.mkdir()
+        (folder / "kept.json").write_text("{}", encoding="utf-8")
+    os.utime(folders[0], (0, 0))
+    asked(region, "graph")
+    assert [folder.is_dir() for folder in folders] == [False, True]
+
+
+def test_code_that_changed_since_a_process_began_makes_nothing(place, task, monkeypatch):
+    monkeypatch.setattr(kept, "code_hash", lambda: "of other code")
+    told = []
+    monkeypatch.setattr(kept, "tell", told.append)
+    kept._tell_once.cache_clear()
+    assert asked(town_of(place, task), "graph") is None
+    assert "the program was changed meanwhile" in told[0]
+
+
+def test_a_cache_where_plugins_are_imported_from_is_hidden_and_nothing_is_kept_in_it(
+    place, task, shelf, tmp_path, monkeypatch
+):
+    region = town_of(place, task)
+    worker = Worker(spec="graph_only", reach=Reach(readable=[region], hidden=[]), limits=Limits())
+    cache = str(shelf.parent)
+    assert cache not in worker._policy("/scratch").hidden
+    monkeypatch.chdir(tmp_path)  # as of a user who works at home
+    assert [reply.status for reply in replies(place, task, "graph_only")] == ["ok"] * 2
+    assert [*shelf.glob("*/*/")] == []
+    policy = worker._policy("/scratch")
+    assert cache in policy.hidden
+    assert not any(path.startswith(cache) for path in policy.readable)
 
 
 def replies(place, task, spec):

@@ -2,6 +2,7 @@
 """The process that makes what is kept of a map (`running.kept`): code of ours alone, no plugin is imported."""
 
 import json
+import os
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -63,8 +64,10 @@ def _check(region: Path, digest: str) -> None:
 
 def main() -> None:
     """Make what standard input orders."""
-    kernel.prctl(kernel.PR_SET_PDEATHSIG, signal.SIGKILL)  # whoever ordered it held the lock of the folder
+    kernel.prctl(kernel.PR_SET_PDEATHSIG, signal.SIGKILL)  # with whoever ordered it, who holds the lock of the folder
     order = json.loads(sys.stdin.read())
+    if order.pop("by") != os.getppid():
+        raise StoreError("whoever ordered it is gone")
     if order.pop("code") != code_hash():  # it would lie under the name of what other code makes
         raise StoreError("the program was changed meanwhile")
     order |= {name: Path(order[name]) for name in ("region", "into")}

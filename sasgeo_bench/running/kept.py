@@ -145,7 +145,7 @@ def _is_worth_it(manifest: Manifest) -> bool:
 def _make(order: Mapping[str, JsonValue], timeout_s: float) -> None:
     made = subprocess.run(  # noqa: S603 - our own module, by our own interpreter
         [sys.executable, "-P", "-m", _MAKER],
-        input=json.dumps({**order, "code": code_hash()}).encode(),
+        input=json.dumps({**order, "by": os.getpid(), "code": code_hash()}).encode(),
         capture_output=True,
         timeout=timeout_s,
         check=False,

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is kept of a map is what would be made, of this map and these settings; and no plugin can change it."""
 
+import io
+import json
 import os
 import pwd
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +255,14 @@ def test_code_that_changed_since_a_process_began_makes_nothing(place, task, monk
     kept._tell_once.cache_clear()
     assert asked(town_of(place, task), "graph") is None
     assert "the program was changed meanwhile" in told[0]
+
+
+def test_a_maker_whose_orderer_is_gone_makes_nothing(monkeypatch):
+    order = {"by": os.getpid(), "code": kept.code_hash()}  # by this process, whose parent is another one
+    monkeypatch.setattr(sys, "stdin", io.StringIO(json.dumps(order)))
+    monkeypatch.setattr(keeper.kernel, "prctl", lambda *_: True)
+    with pytest.raises(StoreError, match="is gone"):
+        keeper.main()
 
 
 def test_a_cache_where_plugins_are_imported_from_is_hidden_and_nothing_is_kept_in_it(

@@ -16,9 +16,9 @@ from typing import Final
 import cv2
 import geopandas as gpd
 import numpy as np
+import scipy  # its parts are loaded where they are used: few regions have imagery
 import shapely
 from numpy.typing import NDArray
-from scipy import fft
 
 from sasgeo_bench.core.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.core.folders import file_record, fresh_folder, locked, scratch_folder, sha256_of
@@ -618,10 +618,10 @@ def _doubled(values: NDArray[np.float32], step_m: float) -> Complex:
 def _correlation(on_map: _Edges, seen: _Edges) -> Surface:
     """Return the sum of products for each offset; the picture is larger than the map by the reach on each side."""
     template, picture = on_map.field, seen.field
-    shape = tuple(fft.next_fast_len(size) for size in picture.shape)
-    product = fft.fft2(picture, shape) * np.conj(fft.fft2(template, shape))
+    shape = tuple(scipy.fft.next_fast_len(size) for size in picture.shape)
+    product = scipy.fft.fft2(picture, shape) * np.conj(scipy.fft.fft2(template, shape))
     count = picture.shape[0] - template.shape[0] + 1
-    return np.asarray(fft.ifft2(product)[:count, :count].real)
+    return np.asarray(scipy.fft.ifft2(product)[:count, :count].real)
 
 
 def _clear_peak_m(surface: Surface, step_m: float) -> tuple[float, float] | None:

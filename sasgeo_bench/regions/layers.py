@@ -22,9 +22,6 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import Delaunay
 from tifffile import TiffFile, TiffPage, TiffWriter
 
 from sasgeo_bench.core.errors import ImageryError, SasgeoError, StoreError
@@ -303,9 +300,19 @@ def groups_within(shapes: Shapes, gap_m: float) -> Ints:
         return np.empty(0, dtype=np.int64)
     left, right = _near_pairs(shapes, gap_m).T
     is_near = shapely.dwithin(shapes[left], shapes[right], gap_m)
-    links = coo_array((is_near, (left, right)), shape=(len(shapes), len(shapes)))
-    links.eliminate_zeros()
-    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+    return _components(len(shapes), left[is_near], right[is_near])
+
+
+def _components(count: int, left: Ints, right: Ints) -> Ints:
+    """Number the components of a graph by their first nodes, shape (count,)."""
+    # scipy has it as well, and takes a sixth of a second to import
+    first, before = np.arange(count), np.empty(0, dtype=np.int64)
+    while not np.array_equal(first, before):
+        before = first.copy()
+        for one, other in ((left, right), (right, left)):
+            np.minimum.at(first, first[one], first[other])
+        first = first[first]
+    return np.asarray(np.unique(first, return_inverse=True)[1], dtype=np.int64)
 
 
 def touching_pairs(shapes: Shapes) -> Ints:
@@ -351,7 +358,7 @@ def delaunay_pairs(en_m: Floats, longest_m: float) -> Ints:
 
 def _strict_pairs(en_m: Floats) -> Ints:
     """Return edges of the triangulation whose two opposite angles sum to less than a half turn."""
-    corners = Delaunay(en_m).simplices.astype(np.int64)
+    corners = _triangles(en_m)
     tip = corners.ravel()
     base = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2).reshape(-1, PLANE))
     arms = en_m[base] - en_m[tip][:, None]
@@ -364,6 +371,21 @@ def _strict_pairs(en_m: Floats) -> Ints:
     is_hull = uses == 1
     is_strict = np.bincount(edge, weights=cotangent) > 1e-6  # sum of two cotangents that counts as 0, dimensionless
     return np.asarray(base[first][is_hull | is_strict])
+
+
+def _triangles(en_m: Floats) -> Ints:
+    """Return the rows of the corners of the Delaunay triangles, shape (T, 3)."""
+    places, row = np.unique(en_m, axis=0, return_index=True)
+    if len(places) < len(en_m):
+        # Of several at one place a corner is one, which Qhull names: most maps have none, and need not wait for scipy
+        from scipy.spatial import Delaunay  # noqa: PLC0415 - as above
+
+        return np.asarray(Delaunay(en_m).simplices, dtype=np.int64)
+    triangles = shapely.get_parts(shapely.delaunay_triangles(shapely.multipoints(places)))
+    corners = shapely.get_coordinates(triangles).reshape(-1, TRIANGLE + 1, PLANE)[:, :TRIANGLE]
+    kind = [("east", np.float64), ("north", np.float64)]
+    order = np.searchsorted(places.view(kind)[:, 0], np.ascontiguousarray(corners).view(kind)[..., 0])
+    return np.asarray(row[order], dtype=np.int64)
 
 
 PRESENT: Final = 1

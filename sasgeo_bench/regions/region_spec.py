@@ -18,6 +18,7 @@ from sasgeo_bench.core.config import (
     find_document,
     list_documents,
     read_document,
+    shipped_dir,
     toml_value,
 )
 from sasgeo_bench.core.errors import ConfigError, GridError
@@ -473,6 +474,11 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
         ...
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions or new-region)
     """
+
+    # A file that ships is named by its id, so that the hundreds of others need not be read
+    shipped = shipped_dir("regions") / f"{id_or_path}.toml"
+    if not folders and shipped.name == f"{id_or_path}.toml" and shipped.is_file():
+        return shipped
 
     def known() -> dict[str, Path]:
         return {path.stem: path for path in sorted(OWN_FOLDER.glob("*.toml"))} | list_region_files(folders=folders)

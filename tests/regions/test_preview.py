@@ -63,7 +63,7 @@ def test_the_axes_are_those_of_the_crs(manifest):
     chart = preview._drawn(manifest, empty).axes[0]
     west, south, east, north = manifest.bounds_m
     assert (chart.get_xlim(), chart.get_ylim()) == ((west, east), (south, north))
-    assert chart.images[0].get_extent() == [west, east, south, north]
+    assert chart.images[0].get_extent() == (west, east, south, north)
     assert f"EPSG:{manifest.epsg}" in chart.get_xlabel()
     chart.figure.canvas.draw()
     ticks = {label.get_text(): at for label, at in zip(chart.get_xticklabels(), chart.get_xticks(), strict=True)}

@@ -24,9 +24,9 @@ from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.layers import read_overview
+from sasgeo_bench.regions.layers import PREVIEW_CELLS, read_overview
 from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
-from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
+from sasgeo_bench.regions.preview import write_preview
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file

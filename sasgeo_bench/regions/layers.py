@@ -595,11 +595,13 @@ def write_layers(
     *,
     credit: str = ATTRIBUTION,
     licence: str = LICENCE,
+    filled: Callable[[int], None] = lambda _factor: None,
 ) -> None:
     """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
     `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (C, rows,
-    cols), or None where nothing is mapped. The next level is painted in another thread while one is burnt.
+    cols), or None where nothing is mapped. The next level is painted in another thread while one is burnt. `filled` is
+    given the factor of each level, the coarsest first, once it can be read.
 
     A cloud-optimized file holds its overviews before the full raster, smallest first. GDAL's own COG driver writes
     everything twice to get there, and its empty overviews are made by reading the empty raster. Here all levels are
@@ -614,6 +616,7 @@ def write_layers(
             painters = _in_turn(painting, paint, (factor for factor, _ in levels))
             for (factor, page), burn_window in zip(levels, painters, strict=True):
                 _fill(page, grid.coarsen(factor), burn_window, packing)
+                filled(factor)
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except (RasterioError, OSError) as error:
@@ -683,6 +686,7 @@ def _fill(page: TiffPage, grid: Grid, burn_window: PaintWindow, packing: ThreadP
     for name, values in zip(("TileOffsets", "TileByteCounts"), places, strict=True):
         page.tags[name].overwrite(values.ravel().tolist())
     page.tags["Compression"].overwrite(_ZSTD)
+    file.flush()
 
 
 def _packed(layers: NDArray[np.uint8] | None) -> list[tuple[tuple[int, int, int], bytes]]:
@@ -725,19 +729,33 @@ def _in_turn(pool: ThreadPoolExecutor, work: Callable[[In], Out], items: Iterabl
         yield ahead.popleft().result()
 
 
+PREVIEW_CELLS: Final = 2048  # of `preview.png`, along the longest side
+
+
+def shown_factor(longest: int, factors: Sequence[int], *, longest_cells: int) -> int:
+    """Return the factor of the finest level of which the longer side has at most `longest_cells`, else the coarsest.
+
+    `longest` is the longer side of the map itself, in cells, and `factors` are those of its overviews.
+
+    >>> shown_factor(5000, [4, 16], longest_cells=2048), shown_factor(2000, [4], longest_cells=2048)
+    (4, 1)
+    """
+    levels = (1, *factors)
+    return next((factor for factor in levels if longest / factor <= longest_cells), levels[-1])
+
+
 def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
-    """Read the finest level whose longer side has at most `longest_cells`; shape (C, rows, cols).
+    """Read the level of a `shown_factor`; shape (C, rows, cols).
 
     Raise `StoreError` if the file cannot be read.
     """
     try:
         with open_geotiff(path) as source:
             longest, factors = max(source.height, source.width), source.overviews(1)
-        fitting = [level for level, factor in enumerate(factors) if longest / factor <= longest_cells]
-        if longest <= longest_cells or not factors:
+        chosen = shown_factor(longest, factors, longest_cells=longest_cells)
+        if chosen == 1:
             return read_layers(path)
-        chosen = fitting[0] if fitting else len(factors) - 1
-        with open_geotiff(path, overview_level=chosen) as source:
+        with open_geotiff(path, overview_level=factors.index(chosen)) as source:
             return np.asarray(source.read(), dtype=np.uint8)
     except (RasterioError, OSError) as error:
         raise _unreadable(path, error) from error

@@ -28,7 +28,6 @@ from sasgeo_bench.regions.painting import UNMAPPED, paint_overview, pooled
 from sasgeo_bench.regions.region import Manifest, Region
 
 _DPI: Final = 110
-PREVIEW_CELLS: Final = 2048  # of `preview.png`, along the longest side
 _MOST_CELLS: Final = 1024  # of a figure, along a side: more are no more to see
 _LEGEND_INCHES: Final = 2.9
 _MAP_INCHES: Final = 9.6

@@ -469,17 +469,20 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
            [  0,   1,   1, 255],
            [  0,   0,   0, 255]], dtype=uint8)
     """
-    layers = np.zeros((len(paint.classes), grid.rows, grid.cols), dtype=np.uint8)
-    outside = None
-    if not shapely.covers(paint.ground, shapely.box(*grid.bounds_m)).any():
-        outside = np.where(burn(paint.coverage, grid), np.uint8(0), np.uint8(OUTSIDE))
-    for index, band in enumerate(layers):
-        seen = burn_class(paint, index, grid)
-        if seen is not None:
-            band[...] = seen
-        if outside is not None:
-            np.maximum(band, outside, out=band)
+    layers = np.empty((len(paint.classes), *grid.shape), dtype=np.uint8)
+    for band, burnt in zip(layers, _burn_bands(paint, grid), strict=True):
+        band[...] = burnt
     return layers
+
+
+def _burn_bands(paint: Paint, grid: Grid) -> Iterator[NDArray[np.uint8]]:
+    """Burn one class after the other; those of which none is near share one array, and most are such."""
+    ground = np.zeros(grid.shape, dtype=np.uint8)
+    if not shapely.covers(paint.ground, shapely.box(*grid.bounds_m)).any():
+        ground[~burn(paint.coverage, grid)] = OUTSIDE
+    for index in range(len(paint.classes)):
+        seen = burn_class(paint, index, grid)
+        yield ground if seen is None else np.maximum(ground, seen.view(np.uint8))
 
 
 def burn_class(paint: Paint, index: int, grid: Grid) -> NDArray[np.bool_] | None:
@@ -500,14 +503,16 @@ def burn_class(paint: Paint, index: int, grid: Grid) -> NDArray[np.bool_] | None
     name = paint.classes[index]
     seen, cover = burn(near, grid), load_taxonomy().covers.get(name)
     if cover in paint.classes:
+        covered = burn(paint.near(paint.classes.index(cover), grid), grid)
         above = paint.above.get(name, _NO_AREAS)
-        seen &= ~burn(paint.near(paint.classes.index(cover), grid), grid) | burn(above, grid)
+        seen &= ~(covered & ~burn(above, grid) if len(above) else covered)
     return seen
 
 
-def burn_mapped(paint: Paint, grid: Grid) -> NDArray[np.uint8] | None:
-    """Burn a window as `burn_layers` does; None where nothing of it is mapped."""
-    return burn_layers(paint, grid) if shapely.intersects(paint.ground, shapely.box(*grid.bounds_m)).any() else None
+def burn_mapped(paint: Paint, grid: Grid) -> list[NDArray[np.uint8]] | None:
+    """Burn a window as `burn_layers` does, an array for each class; None where nothing of it is mapped."""
+    is_mapped = shapely.intersects(paint.ground, shapely.box(*grid.bounds_m)).any()
+    return list(_burn_bands(paint, grid)) if is_mapped else None
 
 
 def _meets(bounds: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:
@@ -551,9 +556,11 @@ def _crossings(
     """Return row, first column at or right of the crossing, and sign, for every edge and every row's centre line."""
     rings = shapely.get_rings(areas)
     points, ring = shapely.get_coordinates(rings, return_index=True)
-    uv = grid.to_uv(points)
-    joined = ring[1:] == ring[:-1]
-    start, end = uv[:-1][joined], uv[1:][joined]
+    northing_m, (_, south_m, _, north_m) = points[:, 1], grid.bounds_m
+    lower_m, upper_m = np.minimum(northing_m[:-1], northing_m[1:]), np.maximum(northing_m[:-1], northing_m[1:])
+    # Most edges of a sea or a country lie in no row of a window.
+    near = np.flatnonzero((ring[1:] == ring[:-1]) & (lower_m < north_m) & (upper_m > south_m))
+    start, end = grid.to_uv(points[near]), grid.to_uv(points[near + 1])
     # A row's centre line lies at row + 0.5; an edge crosses those in [upper end, lower end).
     first = np.clip(np.ceil(np.minimum(start[:, 1], end[:, 1]) - 0.5), 0, grid.rows).astype(np.int64)
     last = np.clip(np.ceil(np.maximum(start[:, 1], end[:, 1]) - 0.5), 0, grid.rows).astype(np.int64)
@@ -578,7 +585,8 @@ _BIGTIFF_CELLS: Final = 2**31  # compressed, such a file stays far below the 4 G
 
 In = TypeVar("In")
 Out = TypeVar("Out")
-PaintWindow = Callable[[Grid], NDArray[np.uint8] | None]  # None where nothing is mapped
+Burnt = Iterable[NDArray[np.uint8]]  # an array of shape (rows, cols) for each class
+PaintWindow = Callable[[Grid], Burnt | None]  # None where nothing is mapped
 
 
 def overview_factors(grid: Grid) -> tuple[int, ...]:
@@ -599,8 +607,8 @@ def write_layers(
 ) -> None:
     """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
-    `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (C, rows,
-    cols), or None where nothing is mapped. The next level is painted in another thread while one is burnt. `filled` is
+    `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (rows,
+    cols) for each class, or None where nothing is mapped. The next level is painted in another thread while one is burnt. `filled` is
     given the factor of each level, the coarsest first, once it can be read.
 
     A cloud-optimized file holds its overviews before the full raster, smallest first. GDAL's own COG driver writes
@@ -689,18 +697,22 @@ def _fill(page: TiffPage, grid: Grid, burn_window: PaintWindow, packing: ThreadP
     file.flush()
 
 
-def _packed(layers: NDArray[np.uint8] | None) -> list[tuple[tuple[int, int, int], bytes]]:
+def _packed(bands: Burnt | None) -> list[tuple[tuple[int, int, int], bytes]]:
     """Pack the blocks of a window that hold mapped ground, each with its band, row and column among the blocks."""
-    if layers is None:
-        return []
+    kept = [] if bands is None else list(bands)
+    # An array that several classes share is packed once
+    packed = {number: _packed_band(band) for number, band in {id(band): band for band in kept}.items()}
+    return [((number, *place), block) for number, band in enumerate(kept) for place, block in packed[id(band)]]
+
+
+def _packed_band(band: NDArray[np.uint8]) -> list[tuple[tuple[int, int], bytes]]:
     found = []
-    for at in itertools.product(range(len(layers)), *(range(0, side, BLOCK_CELLS) for side in layers.shape[1:])):
-        band, top, left = at
-        block = layers[band, top : top + BLOCK_CELLS, left : left + BLOCK_CELLS]
+    for top, left in itertools.product(*(range(0, side, BLOCK_CELLS) for side in band.shape)):
+        block = band[top : top + BLOCK_CELLS, left : left + BLOCK_CELLS]
         lowest, highest = int(block.min()), int(block.max())
         if lowest == OUTSIDE:
             continue
-        place = (band, top // BLOCK_CELLS, left // BLOCK_CELLS)
+        place = (top // BLOCK_CELLS, left // BLOCK_CELLS)
         found.append((place, _packed_plain(lowest) if lowest == highest else _packed_block(block)))
     return found
 

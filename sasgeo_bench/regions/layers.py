@@ -543,7 +543,7 @@ def burn(areas: NDArray[np.object_], grid: Grid) -> NDArray[np.bool_]:
     """
     row, col, step = _crossings(areas, grid)
     position = row * grid.cols + col
-    order = np.argsort(position, kind="stable")
+    order = np.argsort(position)  # in which order several at one place come makes no difference
     is_inside = np.cumsum(step[order]) > 0
     edges = np.concatenate(([0], position[order], [grid.rows * grid.cols]))
     runs = np.repeat(np.concatenate(([False], is_inside)), np.diff(edges))
@@ -565,15 +565,16 @@ def _crossings(
     first = np.clip(np.ceil(np.minimum(start[:, 1], end[:, 1]) - 0.5), 0, grid.rows).astype(np.int64)
     last = np.clip(np.ceil(np.maximum(start[:, 1], end[:, 1]) - 0.5), 0, grid.rows).astype(np.int64)
     count = last - first
-    edge = np.repeat(np.arange(len(count)), count)
-    row = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + first[edge]
-    is_down = (end[:, 1] > start[:, 1])[edge]
+    is_down = end[:, 1] > start[:, 1]
     # From its upper end, whichever way the ring runs: two parcels round the place on a shared edge alike.
-    upper = np.where(is_down[:, None], start[edge], end[edge])
-    across = np.where(is_down[:, None], end[edge], start[edge]) - upper
-    u = upper[:, 0] + (row + 0.5 - upper[:, 1]) * across[:, 0] / across[:, 1]
-    col = np.clip(np.ceil(u - 0.5), 0, grid.cols).astype(np.int64)
-    return row, col, np.where(is_down, 1, -1)
+    upper = np.where(is_down[:, None], start, end)
+    across = np.where(is_down[:, None], end, start) - upper
+    edge = np.repeat(np.arange(len(count)), count)
+    row = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count - first, count)
+    (u, v), (du, dv) = upper.T, across.T
+    crossed_u = u[edge] + (row + 0.5 - v[edge]) * du[edge] / dv[edge]
+    col = np.clip(np.ceil(crossed_u - 0.5), 0, grid.cols).astype(np.int64)
+    return row, col, np.where(is_down, 1, -1)[edge]
 
 
 BLOCK_CELLS: Final = 512

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.canvas import PlainFigure
 from sasgeo_bench.core.errors import check_given
+from sasgeo_bench.core.texts import plain
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import OUTSIDE
 from sasgeo_bench.regions.painting import UNMAPPED, paint_overview, pooled
@@ -77,9 +78,10 @@ def plot_region(region: Region) -> Figure:
 
 def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]) -> None:
     """Draw a region to a PNG; `overview` is a coarse level of the layers, uint8 of shape (C, rows, cols)."""
-    _drawn(manifest, overview).savefig(
-        path, metadata={"Title": manifest.title, "Copyright": manifest.attribution, "Software": None}, format="png"
-    )
+    # `savefig` would draw everything twice
+    canvas = FigureCanvasAgg(_drawn(manifest, overview))
+    words = {"Title": plain(manifest.title), "Copyright": plain(manifest.attribution), "Software": None}
+    canvas.print_png(path, metadata=words)
 
 
 def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:

@@ -26,5 +26,5 @@ def main() -> None:
             sys.stderr.write("sasgeo-bench: interrupted before it began; run it again\n")
             sys.exit(exit_interrupted())
         finally:
-            # The interpreter looks for cycles as it ends, among all modules: a tenth of a build. Nothing waits for them.
+            # As it ends, the interpreter looks for cycles among all modules: a tenth of a build, which frees nothing.
             gc.freeze()

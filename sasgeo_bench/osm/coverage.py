@@ -70,7 +70,10 @@ def _opened(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     # 150 m: half the width of what is cut off: a road or stream kept whole beyond the edge
     reach = int(150.0 / CELL_M)
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    opened = cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_OPEN, square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    opened = (
+        cv2.morphologyEx(cells.astype(np.uint8), cv2.MORPH_OPEN, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        > 0
+    )
     return np.asarray(opened) if opened.any() else cells
 
 

@@ -609,8 +609,8 @@ def write_layers(
     """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
     `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (rows,
-    cols) for each class, or None where nothing is mapped. The next level is painted in another thread while one is burnt. `filled` is
-    given the factor of each level, the coarsest first, once it can be read.
+    cols) for each class, or None where nothing is mapped. The next level is painted in another thread while one is
+    burnt. `filled` is given the factor of each level, the coarsest first, once it can be read.
 
     A cloud-optimized file holds its overviews before the full raster, smallest first. GDAL's own COG driver writes
     everything twice to get there, and its empty overviews are made by reading the empty raster. Here all levels are

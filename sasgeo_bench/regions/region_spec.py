@@ -474,8 +474,7 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
         ...
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions or new-region)
     """
-
-    # A file that ships is named by its id, so that the hundreds of others need not be read
+    # A file that ships is named by its id, so that the hundreds of others need not be read.
     shipped = shipped_dir("regions") / f"{id_or_path}.toml"
     if not folders and shipped.name == f"{id_or_path}.toml" and shipped.is_file():
         return shipped

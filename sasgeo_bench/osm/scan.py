@@ -107,7 +107,7 @@ class Scan:
     nodes: osmium.index.LocationTable = field(default_factory=lambda: osmium.index.create_map("flex_mem"))
 
     def locator(self) -> osmium.NodeLocationsForWays:
-        """Return what gives ways the places of their nodes once these have been read: they are most of a file."""
+        """Return what gives ways the places of their nodes, which are read once: they are most of a file."""
         locator = osmium.NodeLocationsForWays(self.nodes)
         locator.ignore_errors()  # of nodes that the file lacks
         return locator
@@ -337,7 +337,7 @@ def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box) -> Scan:
 def _ways_and_areas(path: Path, taxonomy: Taxonomy, nodes: osmium.index.LocationTable) -> Iterator[Any]:
     """Yield ways with a key of lines and all areas, in one pass; filters and assembly of areas run in C++."""
     with_key = osmium.filter.KeyFilter(*taxonomy.keys)
-    processor = osmium.FileProcessor(str(path)).with_locations(nodes).with_areas(with_key)
+    processor = osmium.FileProcessor(str(path)).with_locations(nodes).with_areas(with_key)  # type: ignore[arg-type] # it takes a table, too
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
     lines = osmium.filter.KeyFilter(*taxonomy.keys_of("line"))
     lines.enable_for(osmium.osm.WAY)

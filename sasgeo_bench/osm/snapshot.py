@@ -428,9 +428,11 @@ def _versions_at(path: Path, *, until: dt.datetime) -> NDArray[np.int64]:
             numbers.append(number)
             alive.append(item.visible)
     # Of an object the newest version, of equal ones that which stands last, sorts last
-    number, kind, identifier = (np.array(each, dtype=np.int64) for each in (numbers, found.kinds, found.ids))
-    order = np.lexsort((number, np.array(found.versions, dtype=np.int64), identifier, kind))
+    kind, identifier, version, position = (
+        np.array(each, dtype=np.int64) for each in (found.kinds, found.ids, found.versions, numbers)
+    )
+    order = np.lexsort((position, version, identifier, kind))
     is_newest = np.ones(len(order), dtype=bool)
     is_newest[:-1] = (np.diff(kind[order]) != 0) | (np.diff(identifier[order]) != 0)
     newest = order[is_newest]
-    return np.sort(number[newest[np.frombuffer(alive, dtype=np.bool_)[newest]]])
+    return np.sort(position[newest[np.frombuffer(alive, dtype=np.bool_)[newest]]])

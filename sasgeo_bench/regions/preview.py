@@ -4,7 +4,7 @@
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from textwrap import wrap
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -79,7 +79,7 @@ def plot_region(region: Region) -> Figure:
 def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]) -> None:
     """Draw a region to a PNG; `overview` is a coarse level of the layers, uint8 of shape (C, rows, cols)."""
     # `savefig` would draw everything twice
-    canvas = FigureCanvasAgg(_drawn(manifest, overview))
+    canvas: Any = FigureCanvasAgg(_drawn(manifest, overview))  # whose printing has no types
     words = {"Title": plain(manifest.title), "Copyright": plain(manifest.attribution), "Software": None}
     canvas.print_png(path, metadata=words)
 
@@ -131,14 +131,15 @@ class _Picture(AxesImage):
         renderer: RendererBase,
         magnification: float = 1.0,
         unsampled: bool = False,  # noqa: FBT001, FBT002 - as in matplotlib
-    ) -> tuple[NDArray[np.uint8], float, float, Affine2D | None]:
+    ) -> tuple[NDArray[Any], float, float, Affine2D]:
         """Return the picture in pixels of the figure, and its lower left corner there."""
         del unsampled
         picture = np.asarray(self.get_array())
-        left, bottom, right, top = np.rint(self.get_window_extent(renderer).extents * magnification).astype(int)
+        extents = np.array(self.get_window_extent(renderer).extents) * magnification
+        left, bottom, right, top = np.rint(extents).astype(int).tolist()
         size = (max(right - left, 1), max(top - bottom, 1))
         rule = cv2.INTER_AREA if size[0] < picture.shape[1] else cv2.INTER_NEAREST
-        return cv2.resize(picture, size, interpolation=rule)[::-1], left, bottom, None
+        return cv2.resize(picture, size, interpolation=rule)[::-1], left, bottom, Affine2D()
 
 
 def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m_per_inch: float) -> None:

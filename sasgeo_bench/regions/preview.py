@@ -133,11 +133,12 @@ class _Picture(AxesImage):
         unsampled: bool = False,  # noqa: FBT001, FBT002 - as in matplotlib
     ) -> tuple[NDArray[Any], float, float, Affine2D]:
         """Return the picture in pixels of the figure, and its lower left corner there."""
-        del unsampled
-        picture = np.asarray(self.get_array())
+        picture, frame = np.asarray(self.get_array()), np.array(self.axes.bbox.size) * magnification
         extents = np.array(self.get_window_extent(renderer).extents) * magnification
         left, bottom, right, top = np.rint(extents).astype(int).tolist()
         size = (max(right - left, 1), max(top - bottom, 1))
+        if size[0] > 2 * frame[0] or size[1] > 2 * frame[1]:  # of a part alone, there is no need of all pixels
+            return super().make_image(renderer, magnification, unsampled)
         rule = cv2.INTER_AREA if size[0] < picture.shape[1] else cv2.INTER_NEAREST
         return cv2.resize(picture, size, interpolation=rule)[::-1], left, bottom, Affine2D()
 

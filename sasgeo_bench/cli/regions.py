@@ -30,7 +30,6 @@ from sasgeo_bench.regions.region_spec import (
     list_region_files,
     read_region_file,
 )
-from sasgeo_bench.running.memory import be_lean
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 
@@ -510,6 +509,5 @@ def render_imagery_command(options: RenderOptions) -> None:
 
 def build_region_command(options: BuildOptions) -> None:
     """Build regions from dated extracts: layers, features, graph, imagery and preview in OUT/regions/<id>/."""
-    be_lean()
     with shown_progress():
         build_region(**vars(options) | {"say": say})

@@ -436,8 +436,12 @@ def _mend(plan: BuildPlan, kept: Manifest) -> Manifest | None:
 def _write_preview(folder: Path, manifest: Manifest) -> None:
     from sasgeo_bench.regions.preview import write_preview  # noqa: PLC0415 - only a picture needs matplotlib
 
-    overview = read_overview(folder / region_files.LAYERS, longest_cells=PREVIEW_CELLS)
-    write_preview(folder / region_files.PREVIEW, manifest=manifest, overview=overview)
+    layers = folder / region_files.LAYERS
+    write_preview(
+        folder / region_files.PREVIEW,
+        manifest=manifest,
+        overview=read_overview(layers, longest_cells=PREVIEW_CELLS),
+    )
 
 
 @contextmanager

@@ -78,8 +78,9 @@ def plot_region(region: Region) -> Figure:
 
 def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]) -> None:
     """Draw a region to a PNG; `overview` is a coarse level of the layers, uint8 of shape (C, rows, cols)."""
-    # `savefig` would draw everything twice
     canvas: Any = FigureCanvasAgg(_drawn(manifest, overview))  # whose printing has no types
+    del overview  # twice the memory of the picture
+    # `savefig` would draw everything twice
     words = {"Title": plain(manifest.title), "Copyright": plain(manifest.attribution), "Software": None}
     canvas.print_png(path, metadata=words)
 

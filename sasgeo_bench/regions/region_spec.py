@@ -344,7 +344,9 @@ class RegionFile(NamedDocument):
     def origin(self) -> Provenance:
         """Return the lines of provenance, with those sources that are no extract."""
         further = [*filter(None, [self.provenance.further_sources]), *(one.credit for one in self.own_map)]
-        stated = {name: getattr(self.provenance, name) for name in self.provenance.model_fields_set}
+        # In the order of the fields: a set has another one in each process, and so would the file
+        given = [name for name in Provenance.model_fields if name in self.provenance.model_fields_set]
+        stated = {name: getattr(self.provenance, name) for name in given}
         return Provenance(**stated | ({"further_sources": "; ".join(further)} if further else {}))
 
     @property

@@ -117,3 +117,8 @@ def test_a_region_that_ships_is_found_without_reading_the_others(monkeypatch):
     monkeypatch.undo()
     with pytest.raises(ConfigError, match="there is no region"):
         find_region_file("../regions/vaduz")
+
+
+def test_lines_of_provenance_are_written_in_the_order_of_their_fields():
+    stated = '[provenance]\nsource = "a"\ndated_by = "b"\ncountry = "c"\nsurveyed_by = "d"\n'
+    assert list(read(text() + stated).origin.model_dump()) == ["surveyed_by", "country", "dated_by", "source"]

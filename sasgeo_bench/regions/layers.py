@@ -774,17 +774,6 @@ def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
         raise _unreadable(path, error) from error
 
 
-def check_shape(path: Path, shape: tuple[int, int, int]) -> None:
-    """Raise `StoreError` if a file has other layers, rows or columns than its region says, or cannot be read."""
-    try:
-        with open_geotiff(path) as source:
-            found = (source.count, source.height, source.width)
-    except (RasterioError, OSError) as error:
-        raise _unreadable(path, error) from error
-    if found != shape:
-        raise StoreError(f"{path} has layers, rows and columns {found}, its region {shape}: build the region again")
-
-
 def _unreadable(path: Path, error: Exception) -> StoreError:
     if isinstance(error, StoreError):
         return error

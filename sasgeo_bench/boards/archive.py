@@ -29,8 +29,8 @@ from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import METRICS, check_registered, code_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
-from sasgeo_bench.osm.locate import cache_folder
 from sasgeo_bench.regions.region import LICENCE
+from sasgeo_bench.running.kept import kept_folder, most_bytes
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import Task
@@ -178,9 +178,9 @@ def request_of(
     )
 
 
-def fits_folder() -> Path:
-    """Return the folder of the user's cache that keeps what rejectors made of answers; it may be removed."""
-    return cache_folder() / "rejectors"
+def fits_folder() -> Path | None:
+    """Return the folder of the user's cache that keeps what rejectors made of answers; None where nothing is kept."""
+    return kept_folder().with_name("rejectors") if most_bytes() else None
 
 
 def score_all(request: ScoreRequest, *, has_cases: bool = True, results: Path | None = None) -> Scored:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trees and hedges: where crowns stand, and how they are painted: domes, cones, palms, bare branches in winter."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -10,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.sensing.rendering.plan import CROWN, Canvas, along
+from sasgeo_bench.sensing.rendering.plan import CROWN, Canvas, Cells, Mask, along
 from sasgeo_bench.sensing.rendering.seasons import GROWTH
 from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, grain, seed_of
 
 BROAD, CONIFER, PALM, BUSH = range(4)
 _SPACING_M: Final = 3.5
 _RADII_M: Final = (0.6, 0.9, 1.3, 1.8, 2.4, 3.0, 3.7, 4.5, 5.5)
+_BARK: Final = (134.0, 122.0, 108.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -117,35 +119,63 @@ def hedge_trees(canvas: Canvas) -> Trees:
     )
 
 
-def paint_trees(canvas: Canvas, trees: Trees) -> None:
-    """Paint crowns; each raises the height where it is the highest thing. Bare ones leave gaps between branches."""
+def paint_trees(canvas: Canvas, groups: Iterable[Trees]) -> None:
+    """Paint crowns, one group after the other; each raises the height where it is the highest thing.
+
+    Bare ones leave gaps between branches.
+    """
+    # Crowns hide each other, so that a cell is coloured once, by the crown that is the highest there in the end.
+    owner, tone = np.full(canvas.grid.shape, -1, dtype=np.int32), np.empty(canvas.grid.shape, dtype=np.float32)
+    paints = []
+    for trees in groups:
+        sleeps = _sleeping(canvas, trees)
+        _raise_crowns(canvas, trees, sleeps, (owner, tone), first=sum(map(len, paints)))
+        paints.append(np.where(sleeps[:, None], _BARK, trees.colour))
+    paint = np.concatenate(paints)
+    for strip, _ in canvas.strips():
+        at = np.flatnonzero(owner[strip] >= 0)
+        canvas.kind[strip].reshape(-1)[at] = CROWN
+        canvas.owner[strip].reshape(-1)[at] = 0
+        shown = tone[strip].ravel()[at][:, None] * paint[owner[strip].ravel()[at]]
+        canvas.colour[strip].reshape(-1, 3)[at] = np.clip(shown, 0, 255, out=shown)
+
+
+def _sleeping(canvas: Canvas, trees: Trees) -> Mask:
+    """Return which trees are bare in this season, shape (N,)."""
     growth = GROWTH[canvas.season]
-    cell_m = canvas.grid.cell_size_m
-    corner = canvas.grid.to_cells(trees.at_m)
-    sizes = np.abs(trees.radius_m[:, None] - np.array(_RADII_M)).argmin(axis=1)
     is_evergreen = (trees.form == CONIFER) | (trees.form == PALM)
-    sleeps = ~is_evergreen & (
-        np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1)
-    )
-    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3
+    return ~is_evergreen & (np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1))
+
+
+def _raise_crowns(canvas: Canvas, trees: Trees, sleeps: Mask, shown: tuple[Cells, Field], *, first: int) -> None:
+    """Raise the height by crowns; note in `shown` whose is the highest, counted from `first`, and its tone there."""
+    height_m, (owner, tone) = canvas.height_m, shown
+    cell_m, (rows, cols) = canvas.grid.cell_size_m, canvas.grid.shape
+    corner = canvas.grid.to_cells(trees.at_m).astype(np.int64)
+    sizes = np.abs(trees.radius_m[:, None] - np.array(_RADII_M)).argmin(axis=1)
+    shapes = (trees.luck * 1e6).astype(np.int64) % 6  # 6: different crowns of one size
+    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3 if sleeps.any() else np.zeros((0, 0), dtype=bool)
     order = np.argsort(trees.height_m, kind="stable")
-    for tree in order.tolist():
-        shape = int(trees.luck[tree] * 1e6) % 6  # 6: different crowns of one size
-        dome, tone = _crown(int(trees.form[tree]), int(sizes[tree]), shape, cell_m)
-        half = dome.shape[0] // 2
-        row, col = int(corner[tree, 0]) - half, int(corner[tree, 1]) - half
-        if row < 0 or col < 0 or row + dome.shape[0] > canvas.grid.rows or col + dome.shape[1] > canvas.grid.cols:
+    each = zip(
+        order.tolist(),
+        *(part[order].tolist() for part in (trees.form, sizes, shapes, corner[:, 0], corner[:, 1], sleeps)),
+        trees.height_m[order].astype(np.float32),
+        strict=True,
+    )
+    for tree, form, size, shape, at_row, at_col, is_asleep, top_m in each:
+        dome, lumps = _crown(form, size, shape, cell_m)
+        side, half = dome.shape[0], dome.shape[0] // 2
+        row, col = at_row - half, at_col - half
+        if row < 0 or col < 0 or row + side > rows or col + side > cols:
             continue
-        part = np.s_[row : row + dome.shape[0], col : col + dome.shape[1]]
-        crown_m = dome * np.float32(trees.height_m[tree])
-        higher = (crown_m > canvas.height_m[part]) & (dome > 0)
-        if sleeps[tree]:
+        part = np.s_[row : row + side, col : col + side]
+        crown_m, old_m = dome * top_m, height_m[part]
+        higher = crown_m > old_m  # nothing lies lower than 0, which is a crown's height outside it
+        if is_asleep:
             higher &= twigs[part]
-        canvas.height_m[part][higher] = crown_m[higher]
-        canvas.kind[part][higher] = CROWN
-        canvas.owner[part][higher] = 0
-        paint = np.array((134, 122, 108)) if sleeps[tree] else trees.colour[tree]
-        canvas.colour[part][higher] = np.clip(tone[higher][:, None] * paint, 0, 255)
+        np.copyto(old_m, crown_m, where=higher)
+        np.copyto(owner[part], first + tree, where=higher)
+        np.copyto(tone[part], lumps, where=higher)
 
 
 @lru_cache(maxsize=512)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trees and hedges: where crowns stand, and how they are painted: domes, cones, palms, bare branches in winter."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -18,6 +18,7 @@ from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, g
 BROAD, CONIFER, PALM, BUSH = range(4)
 _SPACING_M: Final = 3.5
 _RADII_M: Final = (0.6, 0.9, 1.3, 1.8, 2.4, 3.0, 3.7, 4.5, 5.5)
+_SHAPES: Final = 6  # different crowns of one size
 _BARK: Final = (134.0, 122.0, 108.0)
 
 
@@ -31,6 +32,10 @@ class Trees:
     form: NDArray[np.int64]
     colour: Numbers
     luck: Numbers
+
+    def part(self, chosen: Mask | NDArray[np.int64]) -> "Trees":
+        """Return the chosen trees."""
+        return Trees(**{name: getattr(self, name)[chosen] for name in Trees.__slots__})
 
 
 def scatter(grid: Grid, seed: int) -> tuple[Numbers, NDArray[np.int64]]:
@@ -119,68 +124,81 @@ def hedge_trees(canvas: Canvas) -> Trees:
     )
 
 
-def paint_trees(canvas: Canvas, groups: Iterable[Trees]) -> None:
+def paint_trees(canvas: Canvas, groups: Sequence[Trees]) -> None:
     """Paint crowns, one group after the other; each raises the height where it is the highest thing.
 
     Bare ones leave gaps between branches.
     """
-    # Crowns hide each other, so that a cell is coloured once, by the crown that is the highest there in the end.
-    owner, tone = np.full(canvas.grid.shape, -1, dtype=np.int32), np.empty(canvas.grid.shape, dtype=np.float32)
-    paints = []
-    for trees in groups:
-        sleeps = _sleeping(canvas, trees)
-        _raise_crowns(canvas, trees, sleeps, (owner, tone), first=sum(map(len, paints)))
-        paints.append(np.where(sleeps[:, None], _BARK, trees.colour))
-    paint = np.concatenate(paints)
-    for strip, _ in canvas.strips():
-        at = np.flatnonzero(owner[strip] >= 0)
+    sown = _in_turn(groups)
+    number, crowns = _crowns_of(sown, canvas.grid.cell_size_m)
+    side = np.array([len(crown.height) for crown in crowns], dtype=np.int64)[number]
+    corner = canvas.grid.to_cells(sown.at_m).astype(np.int64) - (side // 2)[:, None]
+    fits = ((corner >= 0) & (corner + side[:, None] <= canvas.grid.shape)).all(axis=1)
+    trees, number, corner, side = sown.part(fits), number[fits], corner[fits], side[fits]
+    bare = _is_bare(canvas, trees)
+    highest = np.full(canvas.grid.shape, -1, dtype=np.int32)
+    _raise_crowns(canvas, highest, [crowns[one].height for one in number.tolist()], trees.height_m, corner, bare)
+    # Crowns hide each other: a cell is coloured once, by the one that is the highest there in the end.
+    colour = np.where(bare[:, None], _BARK, trees.colour)
+    tones = np.concatenate([np.zeros(0, dtype=np.float32), *(crown.tone.ravel() for crown in crowns)])
+    begin = np.cumsum([0, *(crown.tone.size for crown in crowns)])[:-1][number] - corner[:, 0] * side - corner[:, 1]
+    for strip, grid in canvas.strips():
+        at = np.flatnonzero(highest[strip] >= 0)
+        tree = highest[strip].ravel()[at]
+        row, col = np.divmod(at, grid.cols)
+        tone = tones[begin[tree] + (row + strip.start) * side[tree] + col]
         canvas.kind[strip].reshape(-1)[at] = CROWN
         canvas.owner[strip].reshape(-1)[at] = 0
-        shown = tone[strip].ravel()[at][:, None] * paint[owner[strip].ravel()[at]]
-        canvas.colour[strip].reshape(-1, 3)[at] = np.clip(shown, 0, 255, out=shown)
+        canvas.colour[strip].reshape(-1, 3)[at] = np.clip(tone[:, None] * colour[tree], 0, 255)
 
 
-def _sleeping(canvas: Canvas, trees: Trees) -> Mask:
-    """Return which trees are bare in this season, shape (N,)."""
+def _in_turn(groups: Sequence[Trees]) -> Trees:
+    """Return the trees of all groups in the order in which they are painted: by group, then by height."""
+    order = [trees.part(np.argsort(trees.height_m, kind="stable")) for trees in groups]
+    return Trees(**{name: np.concatenate([getattr(trees, name) for trees in order]) for name in Trees.__slots__})
+
+
+def _is_bare(canvas: Canvas, trees: Trees) -> Mask:
+    """Return which trees have no leaves in this season, shape (N,)."""
     growth = GROWTH[canvas.season]
     is_evergreen = (trees.form == CONIFER) | (trees.form == PALM)
     return ~is_evergreen & (np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1))
 
 
-def _raise_crowns(canvas: Canvas, trees: Trees, sleeps: Mask, shown: tuple[Cells, Field], *, first: int) -> None:
-    """Raise the height by crowns; note in `shown` whose is the highest, counted from `first`, and its tone there."""
-    height_m, (owner, tone) = canvas.height_m, shown
-    cell_m, (rows, cols) = canvas.grid.cell_size_m, canvas.grid.shape
-    corner = canvas.grid.to_cells(trees.at_m).astype(np.int64)
-    sizes = np.abs(trees.radius_m[:, None] - np.array(_RADII_M)).argmin(axis=1)
-    shapes = (trees.luck * 1e6).astype(np.int64) % 6  # 6: different crowns of one size
-    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3 if sleeps.any() else np.zeros((0, 0), dtype=bool)
-    order = np.argsort(trees.height_m, kind="stable")
-    each = zip(
-        order.tolist(),
-        *(part[order].tolist() for part in (trees.form, sizes, shapes, corner[:, 0], corner[:, 1], sleeps)),
-        trees.height_m[order].astype(np.float32),
-        strict=True,
-    )
-    for tree, form, size, shape, at_row, at_col, is_asleep, top_m in each:
-        dome, lumps = _crown(form, size, shape, cell_m)
-        side, half = dome.shape[0], dome.shape[0] // 2
-        row, col = at_row - half, at_col - half
-        if row < 0 or col < 0 or row + side > rows or col + side > cols:
-            continue
-        part = np.s_[row : row + side, col : col + side]
-        crown_m, old_m = dome * top_m, height_m[part]
-        higher = crown_m > old_m  # nothing lies lower than 0, which is a crown's height outside it
-        if is_asleep:
-            higher &= twigs[part]
-        np.copyto(old_m, crown_m, where=higher)
-        np.copyto(owner[part], first + tree, where=higher)
-        np.copyto(tone[part], lumps, where=higher)
+def _raise_crowns(
+    canvas: Canvas, highest: Cells, domes: Sequence[Field], height_m: Numbers, corner: NDArray[np.int64], bare: Mask
+) -> None:
+    """Raise the height of a canvas by crowns in turn; `highest` gets the number of the crown that did so last."""
+    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3 if bare.any() else np.zeros((0, 0), dtype=bool)
+    each = zip(domes, height_m.astype(np.float32), *corner.T.tolist(), bare.tolist(), strict=True)
+    for tree, (dome, top_m, row, col, is_bare) in enumerate(each):
+        rows, cols = slice(row, row + len(dome)), slice(col, col + len(dome))
+        crown_m, old_m = dome * top_m, canvas.height_m[rows, cols]
+        if is_bare:
+            crown_m *= twigs[rows, cols]
+        np.copyto(highest[rows, cols], tree, where=crown_m > old_m)  # outside a crown it is 0, and nothing lies lower
+        np.maximum(old_m, crown_m, out=old_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Crown:
+    """Height (share of the tree's) and brightness of a crown on cells, height 0 outside it; shape (2n + 1, 2n + 1)."""
+
+    height: Field
+    tone: Field
+
+
+def _crowns_of(trees: Trees, cell_m: float) -> tuple[NDArray[np.int64], list[_Crown]]:
+    """Return the number of each tree's crown, shape (N,), and those crowns."""
+    size = np.abs(trees.radius_m[:, None] - np.array(_RADII_M)).argmin(axis=1)
+    shape = (trees.luck * 1e6).astype(np.int64) % _SHAPES
+    kinds = (BUSH + 1, len(_RADII_M), _SHAPES)
+    found, number = np.unique(np.ravel_multi_index((trees.form, size, shape), kinds), return_inverse=True)
+    return number, [_crown(*map(int, np.unravel_index(kind, kinds)), cell_m) for kind in found]
 
 
 @lru_cache(maxsize=512)
-def _crown(form: int, size: int, shape: int, cell_m: float) -> tuple[Field, Field]:
-    """Return height (share of the tree's) and brightness of a crown on cells, 0 outside it; shape (2n + 1, 2n + 1)."""
+def _crown(form: int, size: int, shape: int, cell_m: float) -> _Crown:
     radius = _RADII_M[size] / cell_m
     half = int(np.ceil(radius * 1.15)) + 1
     down, right = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float32)
@@ -205,4 +223,4 @@ def _crown(form: int, size: int, shape: int, cell_m: float) -> tuple[Field, Fiel
         )
         dome = np.where(inside, np.clip(rise + 0.055 * lumps, 0.05, 1.05), 0.0)
         tone = 0.84 + 0.2 * bulge + 0.15 * lumps
-    return dome.astype(np.float32), np.asarray(tone, dtype=np.float32)
+    return _Crown(dome.astype(np.float32), np.asarray(tone, dtype=np.float32))

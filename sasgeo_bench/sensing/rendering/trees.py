@@ -20,6 +20,8 @@ _SPACING_M: Final = 3.5
 _RADII_M: Final = (0.6, 0.9, 1.3, 1.8, 2.4, 3.0, 3.7, 4.5, 5.5)
 _SHAPES: Final = 6  # different crowns of one size
 _BARK: Final = (134.0, 122.0, 108.0)
+_HALF, _NO_TREE = np.uint64(32), np.uint64(2**32 - 1)
+_AT_ONCE: Final = 2**18  # cells of crowns, so that they stay in the cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -129,24 +131,36 @@ def paint_trees(canvas: Canvas, groups: Sequence[Trees]) -> None:
 
     Bare ones leave gaps between branches.
     """
-    sown = _in_turn(groups)
-    number, crowns = _crowns_of(sown, canvas.grid.cell_size_m)
+    trees = _in_turn(groups)
+    number, crowns = _crowns_of(trees, canvas.grid.cell_size_m)
     side = np.array([len(crown.height) for crown in crowns], dtype=np.int64)[number]
-    corner = canvas.grid.to_cells(sown.at_m).astype(np.int64) - (side // 2)[:, None]
+    corner = canvas.grid.to_cells(trees.at_m).astype(np.int64) - (side // 2)[:, None]
     fits = ((corner >= 0) & (corner + side[:, None] <= canvas.grid.shape)).all(axis=1)
-    trees, number, corner, side = sown.part(fits), number[fits], corner[fits], side[fits]
     bare = _is_bare(canvas, trees)
-    highest = np.full(canvas.grid.shape, -1, dtype=np.int32)
-    _raise_crowns(canvas, highest, [crowns[one].height for one in number.tolist()], trees.height_m, corner, bare)
-    # Crowns hide each other: a cell is coloured once, by the one that is the highest there in the end.
+    # A height that is not negative sorts by the bits of its float32. Behind them stands whose it is: of equal heights
+    # the one of what is there already is seen, or that of the first crown. So each cell is painted once.
+    seen = (canvas.height_m + np.float32(0)).view(np.uint32).astype(np.uint64) << _HALF | _NO_TREE
+    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3 if bare.any() else np.ones((1, 1), dtype=bool)
+    for kind, crown in enumerate(crowns):
+        own = np.flatnonzero((number == kind) & fits)
+        row, col = np.nonzero(crown.height)
+        for chosen in np.array_split(own, 1 + len(own) * len(row) // _AT_ONCE):
+            cell = (corner[chosen] @ (canvas.grid.cols, 1))[:, None] + (row * canvas.grid.cols + col)
+            crown_m = crown.height[row, col] * trees.height_m[chosen, None].astype(np.float32)
+            key = crown_m.view(np.uint32).astype(np.uint64) << _HALF | (_NO_TREE - 1 - chosen.astype(np.uint64))[:, None]
+            if bare[chosen].any():
+                key[bare[chosen, None] & ~twigs.ravel()[cell]] = 0
+            np.maximum.at(seen.ravel(), cell.ravel(), key.ravel())
     colour = np.where(bare[:, None], _BARK, trees.colour)
     tones = np.concatenate([np.zeros(0, dtype=np.float32), *(crown.tone.ravel() for crown in crowns)])
     begin = np.cumsum([0, *(crown.tone.size for crown in crowns)])[:-1][number] - corner[:, 0] * side - corner[:, 1]
     for strip, grid in canvas.strips():
-        at = np.flatnonzero(highest[strip] >= 0)
-        tree = highest[strip].ravel()[at]
+        behind = seen[strip].astype(np.uint32)
+        at = np.flatnonzero(behind != _NO_TREE)
+        tree = (_NO_TREE - 1 - behind.ravel()[at]).astype(np.int64)
         row, col = np.divmod(at, grid.cols)
         tone = tones[begin[tree] + (row + strip.start) * side[tree] + col]
+        canvas.height_m[strip].reshape(-1)[at] = (seen[strip].ravel()[at] >> _HALF).astype(np.uint32).view(np.float32)
         canvas.kind[strip].reshape(-1)[at] = CROWN
         canvas.owner[strip].reshape(-1)[at] = 0
         canvas.colour[strip].reshape(-1, 3)[at] = np.clip(tone[:, None] * colour[tree], 0, 255)
@@ -163,21 +177,6 @@ def _is_bare(canvas: Canvas, trees: Trees) -> Mask:
     growth = GROWTH[canvas.season]
     is_evergreen = (trees.form == CONIFER) | (trees.form == PALM)
     return ~is_evergreen & (np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1))
-
-
-def _raise_crowns(
-    canvas: Canvas, highest: Cells, domes: Sequence[Field], height_m: Numbers, corner: NDArray[np.int64], bare: Mask
-) -> None:
-    """Raise the height of a canvas by crowns in turn; `highest` gets the number of the crown that did so last."""
-    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3 if bare.any() else np.zeros((0, 0), dtype=bool)
-    each = zip(domes, height_m.astype(np.float32), *corner.T.tolist(), bare.tolist(), strict=True)
-    for tree, (dome, top_m, row, col, is_bare) in enumerate(each):
-        rows, cols = slice(row, row + len(dome)), slice(col, col + len(dome))
-        crown_m, old_m = dome * top_m, canvas.height_m[rows, cols]
-        if is_bare:
-            crown_m *= twigs[rows, cols]
-        np.copyto(highest[rows, cols], tree, where=crown_m > old_m)  # outside a crown it is 0, and nothing lies lower
-        np.maximum(old_m, crown_m, out=old_m)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

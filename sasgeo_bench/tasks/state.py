@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -25,6 +26,19 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
 DRAWN_CLASSES: Final = load_taxonomy().having("drawn")
+BLOCK_M: Final = 8.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Blocks:
+    """A map in square blocks of about `BLOCK_M`: fractions of the mapped cells and of those of each class, 0..1.
+
+    Both have the shape of `grid`.
+    """
+
+    grid: Grid
+    known: NDArray[np.float32]
+    shares: dict[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +127,31 @@ class State:
         return np.array([self.has(name).sum() for name in self.classes]) / max(1, int(self.known.sum()))
 
     @cached_property
+    def blocks(self) -> Blocks:
+        """Return the map in blocks."""
+        factor = max(1, round(BLOCK_M / self.grid.cell_size_m))
+        there, grid = int(np.bitwise_or.reduce(self.bits.bits, axis=None)), self.grid.coarsen(factor)
+        nothing = np.zeros(grid.shape, dtype=np.float32)
+        return Blocks(
+            grid=grid,
+            known=_mean_blocks(self.known, factor),
+            shares={
+                name: _mean_blocks(self.has(name), factor) if there >> at & 1 else nothing
+                for at, name in enumerate(self.classes)
+            },
+        )
+
+    @cached_property
     def drawn(self) -> NDArray[np.bool_]:
         """Return where any of `DRAWN_CLASSES` is present."""
         mask = np.uint32(sum(1 << self.classes.index(name) for name in DRAWN_CLASSES if name in self.classes))
         return np.asarray((self.bits.bits & mask).astype(bool) & self.known)
+
+
+def _mean_blocks(mask: NDArray[np.bool_], factor: int) -> NDArray[np.float32]:
+    """Return the fraction of a mask in square blocks; the last blocks are padded with False."""
+    rows, cols = -(-mask.shape[0] // factor), -(-mask.shape[1] // factor)
+    padded = np.zeros((rows * factor, cols * factor), dtype=np.uint8)
+    np.multiply(mask, np.uint8(255), out=padded[: mask.shape[0], : mask.shape[1]])
+    found = cv2.resize(padded, (cols, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(found, dtype=np.float32) / np.float32(255)

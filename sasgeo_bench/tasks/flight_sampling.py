@@ -2,8 +2,9 @@
 """Flights of a suite over a region, and their queries and truths: views in order, with odometry between them."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -35,7 +36,7 @@ from sasgeo_bench.tasks.query import (
     flight_id,
     view_id,
 )
-from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, Job, drawn_share, make_prior
+from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, Drafts, DrawnShares, Job, make_prior, share_of
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import (
@@ -201,6 +202,7 @@ class Airspace:
     seeds: Seeds
     group: PriorGroup
     flown: LoggedFlight | None = None
+    shares: DrawnShares = field(default_factory=DrawnShares)
 
     def seeds_of(self, index: int) -> Seeds:
         """Return the seeds of one flight."""
@@ -349,7 +351,7 @@ class Airspace:
     def _is_drawn(self, views: Trajectory, scale: float) -> bool:
         variant, maps = self.suite.variants[0], (self.scene.map, *self.suite.older(self.scene))
         poses = [pose_of(views, frame, scale) for frame in range(len(views))]
-        means = [np.mean([drawn_share(state, pose, variant) for pose in poses]) for state in maps]
+        means = [np.mean([self.shares.of(state, pose, variant) for pose in poses]) for state in maps]
         return float(min(means)) >= self.suite.card.min_density
 
 
@@ -383,7 +385,9 @@ _MOST_GAP: Final = 1 / 3  # of a flight
 
 @dataclass(frozen=True, kw_only=True)
 class FlightDrawer:
-    """Draw the flights of one suite on one region; `carried` caches where carried drones come from.
+    """Draw the flights of one suite on one region.
+
+    `carried` caches where carried drones come from, `drafts` views that several variants have.
 
     `told` says where odometry is from (`odometry`), and fixes of a weak receiver (`gnss`): fields of `TaskOrigin`.
     """
@@ -393,6 +397,7 @@ class FlightDrawer:
     choice: Choice = EVERYTHING
     told: Mapping[str, str] = field(default_factory=dict)
     carried: dict[tuple[int, float], Trajectory | None] = field(default_factory=dict)
+    drafts: Drafts = field(default_factory=Drafts)
 
     @classmethod
     def of(cls, airspace: Airspace, flights: dict[int, Flight], choice: Choice) -> "FlightDrawer":
@@ -473,8 +478,10 @@ class FlightDrawer:
         Pictures are drawn place by place, since a place is painted once.
         """
         if not self.suite.is_pictured:
+            self.drafts.asked.update(map(self._alike, jobs))
             for job in jobs:
                 yield from self._flown(job)
+                self.drafts.leave(self._alike(job))
             return
         found: dict[str, list[tuple[Query, Truth]]] = {job.query_id: [] for job in jobs}
         for site in dict.fromkeys(job.site.index for job in jobs):
@@ -484,6 +491,10 @@ class FlightDrawer:
                     found[job.query_id].append(pair)
         for job in jobs:
             yield from found[job.query_id]
+
+    def _alike(self, job: Job) -> Hashable:
+        """Return what all flights have in common whose views are the same where they are at the same place."""
+        return (job.site.index, self.suite.look(job.variant), self.suite.mission(job.variant).draw)
 
     def _flown(self, job: Job) -> Iterator[tuple[Query, Truth]]:
         mission, flight = self.suite.mission(job.variant), self.flights[job.site.index]
@@ -559,8 +570,9 @@ class FlightDrawer:
         group = mission.group or self.airspace.group
         seeds = self._seeds(job.site)
         of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
-        site = replace(job.site, pose=pose, density=drawn_share(scene.map, pose, variant))
-        draft = self.suite.draw(ViewRequest(scene=scene, site=site, variant=variant, seeds=of_view, flight_seeds=seeds))
+        site = replace(job.site, pose=pose, density=self.airspace.shares.of(scene.map, pose, variant))
+        request = ViewRequest(scene=scene, site=site, variant=variant, seeds=of_view, flight_seeds=seeds)
+        draft = self.drafts.of(self._alike(job), (step.frame, pose), partial(self.suite.draw, request))
         evidence = draft.evidence
         if not measured["is_seen"]:
             evidence = evidence.replace(np.full_like(evidence.cells, UNKNOWN))
@@ -598,7 +610,7 @@ class FlightDrawer:
             views = (variant.view(place, site.pose) for place in (self.scene.world, state))
             changed = 0.0 if state is self.scene.world else changed_share(*views)
         is_present = state.knows(site.pose)
-        is_blank = is_present and drawn_share(state, site.pose, variant) < LEAST_DRAWN
+        is_blank = is_present and self.airspace.shares.of(state, site.pose, variant) < LEAST_DRAWN
         return Truth(
             query_id=query.query_id,
             is_present=is_present,
@@ -609,7 +621,7 @@ class FlightDrawer:
             kind=variant.kind,
             strength=variant.strength,
             strength_unit=self.suite.card.strength_unit,
-            unknown_share=query.evidence.unknown_share,
+            unknown_share=share_of(query.evidence.cells == UNKNOWN),
             changed_share=changed,
             feature_density=site.density,
             alias_index=None,

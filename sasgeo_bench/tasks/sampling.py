@@ -3,8 +3,9 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -82,29 +83,60 @@ class _Kept:
 
 @dataclass(kw_only=True, eq=False)
 class Drafts:
-    """Drafts of a suite, which are the same for all tracks: each is kept until no further one asks for it.
+    """Drafts of views that are asked for several times, each drawn once: they are the same for every track, say.
 
-    `asked` is how often each will be asked for, by site and variant. They take `room_bytes` at most: what finds no room
-    is drawn again.
+    They are kept by groups, packed, each until as many have left its group as `asked` says; all take `room_bytes` at
+    most, and what finds no room is drawn again.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.regions.evidence import Evidence
+    >>> def draw():
+    ...     print("drawn")
+    ...     cells = np.zeros((1, 2, 2), dtype=np.uint8)
+    ...     return QueryDraft(evidence=Evidence(classes=("water",), cells=cells, cell_size_m=1.0))
+    >>> drafts = Drafts(asked=Counter({"pair": 2}))
+    >>> for _ in range(2):
+    ...     found = drafts.of("pair", "view", draw)
+    ...     drafts.leave("pair")
+    drawn
     """
 
-    asked: Counter[tuple[int, Variant]] = field(default_factory=Counter)
+    asked: Counter[Hashable] = field(default_factory=Counter)
     room_bytes: int = _KEPT_BYTES
-    _kept: dict[tuple[int, Variant], _Kept] = field(default_factory=dict, init=False, repr=False)
+    _kept: dict[Hashable, dict[Hashable, _Kept]] = field(default_factory=dict, init=False, repr=False)
 
-    def of(self, suite: Suite, request: ViewRequest) -> QueryDraft:
-        """Return the draft of a view."""
-        key = (request.site.index, request.variant)
-        self.asked[key] -= 1
-        kept = self._kept.get(key)
-        draft = suite.draw(request) if kept is None else kept.whole()
+    def of(self, group: Hashable, view: Hashable, draw: Callable[[], QueryDraft]) -> QueryDraft:
+        """Return the draft of a view of a group."""
+        kept = self._kept.get(group, {}).get(view)
+        if kept is not None:
+            return kept.whole()
+        draft = draw()
         is_plain = draft.vectors is None and not draft.frames and draft.evidence.confidence is None
-        if kept is None and is_plain and self.asked[key] > 0 and self.room_bytes > 0:
-            kept = self._kept[key] = _Kept.of(draft)
+        if is_plain and self.asked[group] > 1 and self.room_bytes > 0:
+            kept = self._kept.setdefault(group, {})[view] = _Kept.of(draft)
             self.room_bytes -= len(kept.cells)
-        elif kept is not None and self.asked[key] <= 0:
-            self.room_bytes += len(self._kept.pop(key).cells)
         return draft
+
+    def leave(self, group: Hashable) -> None:
+        """Count one who asks for the views of a group no more."""
+        self.asked[group] -= 1
+        if self.asked[group] <= 0:
+            self.room_bytes += sum(len(kept.cells) for kept in self._kept.pop(group, {}).values())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnShares:
+    """`drawn_share` of the views of maps, counted once for each."""
+
+    _found: dict[tuple[str, Pose, int, float], float] = field(default_factory=dict, init=False, repr=False)
+
+    def of(self, state: State, pose: Pose, variant: Variant) -> float:
+        """Return the share that a map shows in a view."""
+        key = (state.region, pose, variant.view_cells, variant.cell_size_m)
+        if key not in self._found:
+            self._found[key] = drawn_share(state, pose, variant)
+        return self._found[key]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +155,7 @@ class Drawer:
     choice: Choice = EVERYTHING
     windows: dict[tuple[str, float], Windows] = field(default_factory=dict)
     mined: dict[tuple[str, float, int], Decoys] = field(default_factory=dict)
-    shares: dict[tuple[str, Pose, int, float], float] = field(default_factory=dict)
+    shares: DrawnShares = field(default_factory=DrawnShares)
     rivals: RivalCheck = field(default_factory=RivalCheck)
     drafts: Drafts = field(default_factory=Drafts)
 
@@ -159,7 +191,7 @@ class Drawer:
         a retrieval query decides nothing.
         """
         is_smaller = job.variant.side_m < self.suite.main_side_m
-        if is_smaller and self._drawn_share(self.scene.map, job.site.pose, job.variant) < LEAST_DRAWN:
+        if is_smaller and self.shares.of(self.scene.map, job.site.pose, job.variant) < LEAST_DRAWN:
             return f"less than {LEAST_DRAWN:.0%} of the map is drawn there"
         if job.track != "retrieval":
             return None
@@ -181,7 +213,9 @@ class Drawer:
         """Draw one query and its truth."""
         site, seeds = job.site, self._site_seeds(job.site)
         request = ViewRequest(scene=self.scene, site=site, variant=job.variant, seeds=seeds)
-        draft = self.drafts.of(self.suite, request)
+        own = (site.index, job.variant)
+        draft = self.drafts.of(own, None, partial(self.suite.draw, request))
+        self.drafts.leave(own)
         group = draft.group or self.group
         if job.track == "retrieval":  # a disc around the truth would show which of the candidates is right
             group = replace(group, radius_m=None)
@@ -238,7 +272,7 @@ class Drawer:
             views = (variant.view(place, site.pose) for place in (world, state))
             changed = 0.0 if state is world else changed_share(*views)
         # Mark queries at places where the searched map shows hardly any feature
-        is_blank = draft.has_pose and self._drawn_share(state, draft.pose or site.pose, variant) < LEAST_DRAWN
+        is_blank = draft.has_pose and self.shares.of(state, draft.pose or site.pose, variant) < LEAST_DRAWN
         return Truth(
             query_id=job.query_id,
             is_present=draft.is_present,
@@ -249,7 +283,7 @@ class Drawer:
             kind=kind_of(variant.role, draft.kind or variant.kind, draft.measured),
             strength=variant.strength if draft.strength is None else draft.strength,
             strength_unit=self.suite.card.strength_unit,
-            unknown_share=_share(draft.evidence.cells == UNKNOWN),
+            unknown_share=share_of(draft.evidence.cells == UNKNOWN),
             changed_share=changed,
             feature_density=site.density if draft.density is None else draft.density,
             alias_index=decoys.alias_index if draft.has_pose and draft.pose is None else None,
@@ -259,12 +293,6 @@ class Drawer:
             detector=variant.detector,
             labels=draft.labels,
         )
-
-    def _drawn_share(self, state: State, pose: Pose, variant: Variant) -> float:
-        key = (state.region, pose, variant.view_cells, variant.cell_size_m)
-        if key not in self.shares:
-            self.shares[key] = drawn_share(state, pose, variant)
-        return self.shares[key]
 
     def _twins_m(self, site: Site, draft: QueryDraft) -> tuple[tuple[float, float], ...]:
         """Return the twins of a site (easting, northing) if a draft shows the site and has twins."""
@@ -321,10 +349,10 @@ def drawn_share(state: State, pose: Pose, variant: Variant) -> float:
     """Return the fraction of a view's cells in which a map shows a road, building, water or other drawn feature."""
     view = variant.view(state, pose)
     layers = [view.classes.index(name) for name in (*DRAWN_CLASSES, "water") if name in view.classes]
-    return _share((view.cells[layers] == PRESENT).any(axis=0))
+    return share_of((view.cells[layers] == PRESENT).any(axis=0))
 
 
-def _share(mask: NDArray[np.bool_]) -> float:
+def share_of(mask: NDArray[np.bool_]) -> float:
     """Return the mean of a mask: to count it takes a quarter of the time."""
     return np.count_nonzero(mask) / mask.size
 

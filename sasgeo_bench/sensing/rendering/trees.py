@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.sensing.rendering.plan import CROWN, Canvas, Cells, Mask, along
+from sasgeo_bench.sensing.rendering.plan import CROWN, Canvas, Mask, along
 from sasgeo_bench.sensing.rendering.seasons import GROWTH
 from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, grain, seed_of
 
@@ -147,7 +147,9 @@ def paint_trees(canvas: Canvas, groups: Sequence[Trees]) -> None:
         for chosen in np.array_split(own, 1 + len(own) * len(row) // _AT_ONCE):
             cell = (corner[chosen] @ (canvas.grid.cols, 1))[:, None] + (row * canvas.grid.cols + col)
             crown_m = crown.height[row, col] * trees.height_m[chosen, None].astype(np.float32)
-            key = crown_m.view(np.uint32).astype(np.uint64) << _HALF | (_NO_TREE - 1 - chosen.astype(np.uint64))[:, None]
+            key = (
+                crown_m.view(np.uint32).astype(np.uint64) << _HALF | (_NO_TREE - 1 - chosen.astype(np.uint64))[:, None]
+            )
             if bare[chosen].any():
                 key[bare[chosen, None] & ~twigs.ravel()[cell]] = 0
             np.maximum.at(seen.ravel(), cell.ravel(), key.ravel())

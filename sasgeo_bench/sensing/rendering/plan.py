@@ -149,11 +149,13 @@ class Canvas:
             used += len(at)
 
     def shade(self, cells: Mask, factor: Field) -> None:
-        """Multiply the colour of the chosen cells by a raster."""
+        """Multiply the colour of the chosen cells, one factor for each of them."""
+        used = 0
         for strip, _ in self.strips():
             at = np.flatnonzero(cells[strip])
             here = self.colour[strip].reshape(-1, 3)
-            here[at] = np.clip(here[at] * factor[strip].ravel()[at][:, None].astype(np.float32), 0, 255)
+            here[at] = np.clip(here[at] * factor[used : used + len(at), None], 0, 255)
+            used += len(at)
 
 
 def no_shapes() -> Shapes:

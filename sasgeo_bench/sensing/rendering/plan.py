@@ -4,6 +4,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import cv2
@@ -212,7 +213,7 @@ def burn_numbers(geometry: NDArray[np.object_], grid: Grid) -> Cells:
 def _as_geojson(geometry: shapely.Geometry) -> Mapping[str, object]:
     """Return what `geometry.__geo_interface__` does, which takes ten times as long for a polygon."""
     if shapely.get_type_id(geometry) != shapely.GeometryType.POLYGON:
-        return geometry.__geo_interface__
+        return dict(geometry.__geo_interface__)
     rings = shapely.get_rings(geometry)
     return {"type": "Polygon", "coordinates": [shapely.get_coordinates(ring).tolist() for ring in rings]}
 
@@ -319,8 +320,9 @@ class HeightPyramid:
 
     def highest_within(self, col: Field, row: Field, radius: Field) -> Field:
         """Return at least the highest cell within a radius (cells) of each point; far outside, that of the edge."""
-        # The exponent of a number x in [1, inf) is the least n with x < 2 ** n.
-        level = np.minimum(np.frexp(np.maximum(radius, 1))[1], len(self._rows) - 1)
+        # The exponent of a float32 x in [1, inf), counted as `frexp` does, is the least n with x < 2 ** n.
+        exponent = (np.maximum(radius, np.float32(1)).view(np.int32) >> 23) - 126
+        level = np.minimum(exponent, len(self._rows) - 1)
         rows, cols = self._rows[level], self._cols[level]
         at_row = np.minimum(np.maximum(row, 0).astype(np.int32) >> level, rows - 1)
         at_col = np.minimum(np.maximum(col, 0).astype(np.int32) >> level, cols - 1)
@@ -471,18 +473,21 @@ def _follow(hits: Hits, raster: Field, pixel: NDArray[np.int64], top: Field) -> 
     scratch = _Scratch(len(pixel))
     while len(pixel):
         z_m, found = scratch.look(raster, rays)
-        met = found >= z_m
-        has_met = np.logical_or.reduce(met, axis=0)
-        chosen = np.flatnonzero(has_met)
-        step, ended = met[:, chosen].argmax(axis=0), rays.take(chosen, axis=1)
-        here_m = np.maximum(z_m[step, chosen], 0)  # the ground plane, where the last step went below it
+        above = found < z_m
+        for earlier, later in pairwise(above):  # `logical_and.accumulate` takes each cell by itself
+            later &= earlier
+        chosen, left = np.flatnonzero(~above[-1]), np.flatnonzero(above[-1])
+        ended = rays.take(chosen, axis=1)
+        # The first step that met something, of each ray that did
+        cell = np.add.reduce(above[:-1].view(np.uint8), axis=0, dtype=np.uint8).take(chosen) * np.int64(len(pixel))
+        cell += chosen
+        here_m = np.maximum(z_m.ravel().take(cell), 0)  # the ground plane, where the last step went below it
         at = pixel[chosen]
         hits.col.ravel()[at] = ended[0] - ended[2] * here_m
         hits.row.ravel()[at] = ended[1] - ended[3] * here_m
         hits.z_m.ravel()[at] = here_m
         # 0.6 m: higher above the point that a ray meets, a cell shows its flank there
-        hits.is_side.ravel()[at] = found[step, chosen] - here_m > ended[5] + np.float32(0.6)
-        left = np.flatnonzero(~has_met)
+        hits.is_side.ravel()[at] = found.ravel().take(cell) - here_m > ended[5] + np.float32(0.6)
         pixel, rays = pixel[left], rays.take(left, axis=1)
         rays[4] -= _AT_ONCE * rays[5]
 

@@ -178,7 +178,8 @@ def _is_bare(canvas: Canvas, trees: Trees) -> Mask:
     """Return which trees have no leaves in this season, shape (N,)."""
     growth = GROWTH[canvas.season]
     is_evergreen = (trees.form == CONIFER) | (trees.form == PALM)
-    return ~is_evergreen & (np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1))
+    share = growth.bare_share * (0.85 if growth.bare_share == 1 else 1)
+    return np.asarray(~is_evergreen & (np.mod(trees.luck * 7.31, 1) < share))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,6 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import cv2
@@ -474,8 +473,8 @@ def _follow(hits: Hits, raster: Field, pixel: NDArray[np.int64], top: Field) -> 
     while len(pixel):
         z_m, found = scratch.look(raster, rays)
         above = found < z_m
-        for earlier, later in pairwise(above):  # `logical_and.accumulate` takes each cell by itself
-            later &= earlier
+        for step in range(1, _AT_ONCE):  # `logical_and.accumulate` takes each cell by itself
+            above[step] &= above[step - 1]
         chosen, left = np.flatnonzero(~above[-1]), np.flatnonzero(above[-1])
         ended = rays.take(chosen, axis=1)
         # The first step that met something, of each ray that did

@@ -2,6 +2,7 @@
 """Flights of a suite over a region, and their queries and truths: views in order, with odometry between them."""
 
 import math
+from collections import Counter
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -36,9 +37,9 @@ from sasgeo_bench.tasks.query import (
     flight_id,
     view_id,
 )
-from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, Drafts, DrawnShares, Job, make_prior, share_of
+from sasgeo_bench.tasks.sampling import KEPT_BYTES, LEAST_DRAWN, UNANSWERABLE, Drafts, Job, drawn_share, make_prior
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.state import State, share_of
 from sasgeo_bench.tasks.suites.base import (
     EVERYTHING,
     Choice,
@@ -202,7 +203,6 @@ class Airspace:
     seeds: Seeds
     group: PriorGroup
     flown: LoggedFlight | None = None
-    shares: DrawnShares = field(default_factory=DrawnShares)
 
     def seeds_of(self, index: int) -> Seeds:
         """Return the seeds of one flight."""
@@ -351,7 +351,7 @@ class Airspace:
     def _is_drawn(self, views: Trajectory, scale: float) -> bool:
         variant, maps = self.suite.variants[0], (self.scene.map, *self.suite.older(self.scene))
         poses = [pose_of(views, frame, scale) for frame in range(len(views))]
-        means = [np.mean([self.shares.of(state, pose, variant) for pose in poses]) for state in maps]
+        means = [np.mean([drawn_share(state, pose, variant) for pose in poses]) for state in maps]
         return float(min(means)) >= self.suite.card.min_density
 
 
@@ -385,9 +385,7 @@ _MOST_GAP: Final = 1 / 3  # of a flight
 
 @dataclass(frozen=True, kw_only=True)
 class FlightDrawer:
-    """Draw the flights of one suite on one region.
-
-    `carried` caches where carried drones come from, `drafts` views that several variants have.
+    """Draw the flights of one suite on one region; `carried` caches where carried drones come from.
 
     `told` says where odometry is from (`odometry`), and fixes of a weak receiver (`gnss`): fields of `TaskOrigin`.
     """
@@ -397,7 +395,6 @@ class FlightDrawer:
     choice: Choice = EVERYTHING
     told: Mapping[str, str] = field(default_factory=dict)
     carried: dict[tuple[int, float], Trajectory | None] = field(default_factory=dict)
-    drafts: Drafts = field(default_factory=Drafts)
 
     @classmethod
     def of(cls, airspace: Airspace, flights: dict[int, Flight], choice: Choice) -> "FlightDrawer":
@@ -478,15 +475,15 @@ class FlightDrawer:
         Pictures are drawn place by place, since a place is painted once.
         """
         if not self.suite.is_pictured:
-            self.drafts.asked.update(map(self._alike, jobs))
+            drafts = Drafts(asked=Counter(map(self._alike, jobs)), room_bytes=KEPT_BYTES)
             for job in jobs:
-                yield from self._flown(job)
-                self.drafts.leave(self._alike(job))
+                yield from self._flown(job, drafts)
+                drafts.leave(self._alike(job))
             return
         found: dict[str, list[tuple[Query, Truth]]] = {job.query_id: [] for job in jobs}
         for site in dict.fromkeys(job.site.index for job in jobs):
             own = [job for job in jobs if job.site.index == site]
-            for pairs in zip(*map(self._flown, own), strict=True):
+            for pairs in zip(*(self._flown(job, Drafts()) for job in own), strict=True):
                 for job, pair in zip(own, pairs, strict=True):
                     found[job.query_id].append(pair)
         for job in jobs:
@@ -496,7 +493,7 @@ class FlightDrawer:
         """Return what all flights have in common whose views are the same where they are at the same place."""
         return (job.site.index, self.suite.look(job.variant), self.suite.mission(job.variant).draw)
 
-    def _flown(self, job: Job) -> Iterator[tuple[Query, Truth]]:
+    def _flown(self, job: Job, drafts: Drafts) -> Iterator[tuple[Query, Truth]]:
         mission, flight = self.suite.mission(job.variant), self.flights[job.site.index]
         before = self._elsewhere(flight, mission.carried_m) if mission.carried_m else None
         views = flight.views if before is None else _joined(before, flight)
@@ -525,7 +522,11 @@ class FlightDrawer:
                 least_m = 0.0 if frame else GNSS_M
                 fix = gnss.disc(frame, (place_m[0], place_m[1]), least_m=least_m)
                 own |= {GNSS_OFF: round(float(gnss.away_m[frame]), 1)} if fix[0] is not None else {}
-            yield self._view(job, pose_of(views, frame, flight.scale), step, measured=own | measured, fix=fix)
+            pose = pose_of(views, frame, flight.scale)
+            seeds = self._seeds(job.site).under("view", frame, *([mission.draw] if mission.draw else []))
+            request = self._request(job, pose, seeds)
+            draft = drafts.of(self._alike(job), (frame, pose), partial(self.suite.draw, request))
+            yield self._view(job, request.site, draft, step, measured=own | measured, fix=fix)
 
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:
         """Return what the odometer says: to the middle and from there on what it says in the control."""
@@ -563,16 +564,16 @@ class FlightDrawer:
             self.carried[key] = self.airspace.elsewhere(flight, carried_m)
         return self.carried[key]
 
+    def _request(self, job: Job, pose: Pose, seeds: Seeds) -> ViewRequest:
+        site = replace(job.site, pose=pose, density=drawn_share(self.scene.map, pose, job.variant))
+        flight_seeds = self._seeds(job.site)
+        return ViewRequest(scene=self.scene, site=site, variant=job.variant, seeds=seeds, flight_seeds=flight_seeds)
+
     def _view(
-        self, job: Job, pose: Pose, step: Step, *, measured: dict[str, float], fix: Disc | None
+        self, job: Job, site: Site, draft: QueryDraft, step: Step, *, measured: dict[str, float], fix: Disc | None
     ) -> tuple[Query, Truth]:
-        scene, variant, mission = self.scene, job.variant, self.suite.mission(job.variant)
-        group = mission.group or self.airspace.group
-        seeds = self._seeds(job.site)
-        of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
-        site = replace(job.site, pose=pose, density=self.airspace.shares.of(scene.map, pose, variant))
-        request = ViewRequest(scene=scene, site=site, variant=variant, seeds=of_view, flight_seeds=seeds)
-        draft = self.drafts.of(self._alike(job), (step.frame, pose), partial(self.suite.draw, request))
+        scene, variant, pose, seeds = self.scene, job.variant, site.pose, self._seeds(job.site)
+        group = self.suite.mission(variant).group or self.airspace.group
         evidence = draft.evidence
         if not measured["is_seen"]:
             evidence = evidence.replace(np.full_like(evidence.cells, UNKNOWN))
@@ -610,7 +611,7 @@ class FlightDrawer:
             views = (variant.view(place, site.pose) for place in (self.scene.world, state))
             changed = 0.0 if state is self.scene.world else changed_share(*views)
         is_present = state.knows(site.pose)
-        is_blank = is_present and self.airspace.shares.of(state, site.pose, variant) < LEAST_DRAWN
+        is_blank = is_present and drawn_share(state, site.pose, variant) < LEAST_DRAWN
         return Truth(
             query_id=query.query_id,
             is_present=is_present,

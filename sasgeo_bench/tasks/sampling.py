@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, pack, unpack
+from sasgeo_bench.regions.evidence import UNKNOWN, pack, unpack
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
+from sasgeo_bench.tasks.state import State, share_of
 from sasgeo_bench.tasks.suites.base import (
     EVERYTHING,
     Choice,
@@ -50,7 +50,7 @@ _GOLDEN: Final = math.pi * (3 - math.sqrt(5))  # golden angle: spreads points ev
 _TURNS: Final = 72
 _JITTER_M: Final = STRIDE_M / 2
 _ROUNDED_M: Final = 0.1  # resolution of a disc's centre
-_KEPT_BYTES: Final = 2**26
+KEPT_BYTES: Final = 2**26  # of drafts, packed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,7 +95,7 @@ class Drafts:
     ...     print("drawn")
     ...     cells = np.zeros((1, 2, 2), dtype=np.uint8)
     ...     return QueryDraft(evidence=Evidence(classes=("water",), cells=cells, cell_size_m=1.0))
-    >>> drafts = Drafts(asked=Counter({"pair": 2}))
+    >>> drafts = Drafts(asked=Counter({"pair": 2}), room_bytes=1000)
     >>> for _ in range(2):
     ...     found = drafts.of("pair", "view", draw)
     ...     drafts.leave("pair")
@@ -103,7 +103,7 @@ class Drafts:
     """
 
     asked: Counter[Hashable] = field(default_factory=Counter)
-    room_bytes: int = _KEPT_BYTES
+    room_bytes: int = 0
     _kept: dict[Hashable, dict[Hashable, _Kept]] = field(default_factory=dict, init=False, repr=False)
 
     def of(self, group: Hashable, view: Hashable, draw: Callable[[], QueryDraft]) -> QueryDraft:
@@ -125,26 +125,11 @@ class Drafts:
             self.room_bytes += sum(len(kept.cells) for kept in self._kept.pop(group, {}).values())
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DrawnShares:
-    """`drawn_share` of the views of maps, counted once for each."""
-
-    _found: dict[tuple[str, Pose, int, float], float] = field(default_factory=dict, init=False, repr=False)
-
-    def of(self, state: State, pose: Pose, variant: Variant) -> float:
-        """Return the share that a map shows in a view."""
-        key = (state.region, pose, variant.view_cells, variant.cell_size_m)
-        if key not in self._found:
-            self._found[key] = drawn_share(state, pose, variant)
-        return self._found[key]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Drawer:
     """Draw the queries of one suite on one region.
 
-    `windows`, `mined` and `shares` cache what depends only on the map and the size of a view, `rivals` searches of
-    equal views, `drafts` what several tracks ask.
+    `windows` and `mined` cache what depends only on the map and the size of a view, `rivals` searches of equal views.
     """
 
     suite: Suite
@@ -155,9 +140,7 @@ class Drawer:
     choice: Choice = EVERYTHING
     windows: dict[tuple[str, float], Windows] = field(default_factory=dict)
     mined: dict[tuple[str, float, int], Decoys] = field(default_factory=dict)
-    shares: DrawnShares = field(default_factory=DrawnShares)
     rivals: RivalCheck = field(default_factory=RivalCheck)
-    drafts: Drafts = field(default_factory=Drafts)
 
     def jobs(self, sites: Sequence[Site]) -> list[Job]:
         """Return all queries in the order of their ids, so that neighbours in the table have nothing in common."""
@@ -191,7 +174,7 @@ class Drawer:
         a retrieval query decides nothing.
         """
         is_smaller = job.variant.side_m < self.suite.main_side_m
-        if is_smaller and self.shares.of(self.scene.map, job.site.pose, job.variant) < LEAST_DRAWN:
+        if is_smaller and drawn_share(self.scene.map, job.site.pose, job.variant) < LEAST_DRAWN:
             return f"less than {LEAST_DRAWN:.0%} of the map is drawn there"
         if job.track != "retrieval":
             return None
@@ -201,9 +184,9 @@ class Drawer:
 
     def drawn(self, jobs: Sequence[Job]) -> Iterator[tuple[Query, Truth]]:
         """Yield queries and truths in their order; pictures are drawn site by site, since a place is painted once."""
-        self.drafts.asked.update((job.site.index, job.variant) for job in jobs)
         if not self.suite.is_pictured:
-            yield from map(self.draw, jobs)
+            drafts = Drafts(asked=Counter(map(_alike, jobs)), room_bytes=KEPT_BYTES)
+            yield from (self._drawn(job, drafts) for job in jobs)
             return
         by_site = sorted(jobs, key=lambda job: (job.site.index, job.variant.detector, job.variant.name))
         found = {job.query_id: self.draw(job) for job in by_site}
@@ -211,11 +194,13 @@ class Drawer:
 
     def draw(self, job: Job) -> tuple[Query, Truth]:
         """Draw one query and its truth."""
+        return self._drawn(job, Drafts())
+
+    def _drawn(self, job: Job, drafts: Drafts) -> tuple[Query, Truth]:
         site, seeds = job.site, self._site_seeds(job.site)
         request = ViewRequest(scene=self.scene, site=site, variant=job.variant, seeds=seeds)
-        own = (site.index, job.variant)
-        draft = self.drafts.of(own, None, partial(self.suite.draw, request))
-        self.drafts.leave(own)
+        draft = drafts.of(_alike(job), None, partial(self.suite.draw, request))
+        drafts.leave(_alike(job))
         group = draft.group or self.group
         if job.track == "retrieval":  # a disc around the truth would show which of the candidates is right
             group = replace(group, radius_m=None)
@@ -272,7 +257,7 @@ class Drawer:
             views = (variant.view(place, site.pose) for place in (world, state))
             changed = 0.0 if state is world else changed_share(*views)
         # Mark queries at places where the searched map shows hardly any feature
-        is_blank = draft.has_pose and self.shares.of(state, draft.pose or site.pose, variant) < LEAST_DRAWN
+        is_blank = draft.has_pose and drawn_share(state, draft.pose or site.pose, variant) < LEAST_DRAWN
         return Truth(
             query_id=job.query_id,
             is_present=draft.is_present,
@@ -345,16 +330,14 @@ class Drawer:
         return candidates(own, decoys_m, yaw_deg=yaw_deg, jitter_m=_JITTER_M, rng=rng)
 
 
+def _alike(job: Job) -> Hashable:
+    """Return what all queries of one draft have in common: they differ by their tracks."""
+    return (job.site.index, job.variant)
+
+
 def drawn_share(state: State, pose: Pose, variant: Variant) -> float:
     """Return the fraction of a view's cells in which a map shows a road, building, water or other drawn feature."""
-    view = variant.view(state, pose)
-    layers = [view.classes.index(name) for name in (*DRAWN_CLASSES, "water") if name in view.classes]
-    return share_of((view.cells[layers] == PRESENT).any(axis=0))
-
-
-def share_of(mask: NDArray[np.bool_]) -> float:
-    """Return the mean of a mask: to count it takes a quarter of the time."""
-    return np.count_nonzero(mask) / mask.size
+    return state.drawn_share(pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
 
 
 def _clusters(

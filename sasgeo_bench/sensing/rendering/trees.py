@@ -126,46 +126,82 @@ def hedge_trees(canvas: Canvas) -> Trees:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Stand:
+    """Trees in the order in which they are painted, with the number of each one's crown, its corner (row, col), side.
+
+    `is_bare` has no leaves, `fits` lies wholly on the canvas.
+    """
+
+    trees: Trees
+    crowns: "Sequence[_Crown]"
+    number: NDArray[np.int64]
+    corner: NDArray[np.int64]
+    side: NDArray[np.int64]
+    is_bare: Mask
+    fits: Mask
+
+    @classmethod
+    def of(cls, canvas: Canvas, groups: Sequence[Trees]) -> "_Stand":
+        trees = _in_turn(groups)
+        number, crowns = _crowns_of(trees, canvas.grid.cell_size_m)
+        side = np.array([len(crown.height) for crown in crowns], dtype=np.int64)[number]
+        corner = canvas.grid.to_cells(trees.at_m).astype(np.int64) - (side // 2)[:, None]
+        return cls(
+            trees=trees,
+            crowns=crowns,
+            number=number,
+            corner=corner,
+            side=side,
+            is_bare=_is_bare(canvas, trees),
+            fits=np.asarray(((corner >= 0) & (corner + side[:, None] <= canvas.grid.shape)).all(axis=1)),
+        )
+
+
 def paint_trees(canvas: Canvas, groups: Sequence[Trees]) -> None:
     """Paint crowns, one group after the other; each raises the height where it is the highest thing.
 
     Bare ones leave gaps between branches.
     """
-    trees = _in_turn(groups)
-    number, crowns = _crowns_of(trees, canvas.grid.cell_size_m)
-    side = np.array([len(crown.height) for crown in crowns], dtype=np.int64)[number]
-    corner = canvas.grid.to_cells(trees.at_m).astype(np.int64) - (side // 2)[:, None]
-    fits = ((corner >= 0) & (corner + side[:, None] <= canvas.grid.shape)).all(axis=1)
-    bare = _is_bare(canvas, trees)
-    # A height that is not negative sorts by the bits of its float32. Behind them stands whose it is: of equal heights
-    # the one of what is there already is seen, or that of the first crown. So each cell is painted once.
-    seen = (canvas.height_m + np.float32(0)).view(np.uint32).astype(np.uint64) << _HALF | _NO_TREE
-    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3 if bare.any() else np.ones((1, 1), dtype=bool)
-    for kind, crown in enumerate(crowns):
-        own = np.flatnonzero((number == kind) & fits)
-        row, col = np.nonzero(crown.height)
-        for chosen in np.array_split(own, 1 + len(own) * len(row) // _AT_ONCE):
-            cell = (corner[chosen] @ (canvas.grid.cols, 1))[:, None] + (row * canvas.grid.cols + col)
-            crown_m = crown.height[row, col] * trees.height_m[chosen, None].astype(np.float32)
-            key = (
-                crown_m.view(np.uint32).astype(np.uint64) << _HALF | (_NO_TREE - 1 - chosen.astype(np.uint64))[:, None]
-            )
-            if bare[chosen].any():
-                key[bare[chosen, None] & ~twigs.ravel()[cell]] = 0
-            np.maximum.at(seen.ravel(), cell.ravel(), key.ravel())
-    colour = np.where(bare[:, None], _BARK, trees.colour)
-    tones = np.concatenate([np.zeros(0, dtype=np.float32), *(crown.tone.ravel() for crown in crowns)])
-    begin = np.cumsum([0, *(crown.tone.size for crown in crowns)])[:-1][number] - corner[:, 0] * side - corner[:, 1]
+    stand = _Stand.of(canvas, groups)
+    highest = _highest(canvas, stand)
+    colour = np.where(stand.is_bare[:, None], _BARK, stand.trees.colour)
+    # The tones of all crowns in one row, and where those of each tree would begin if its crown lay in the corner
+    tones = np.concatenate([np.zeros(0, dtype=np.float32), *(crown.tone.ravel() for crown in stand.crowns)])
+    first = np.cumsum([0, *(crown.tone.size for crown in stand.crowns)])[:-1][stand.number]
+    first -= stand.corner[:, 0] * stand.side + stand.corner[:, 1]
     for strip, grid in canvas.strips():
-        behind = seen[strip].astype(np.uint32)
-        at = np.flatnonzero(behind != _NO_TREE)
-        tree = (_NO_TREE - 1 - behind.ravel()[at]).astype(np.int64)
+        height_m, owner = highest[strip] >> _HALF, highest[strip].astype(np.uint32)
+        at = np.flatnonzero(owner != _NO_TREE)
+        tree = (_NO_TREE - 1 - owner.ravel()[at]).astype(np.int64)
         row, col = np.divmod(at, grid.cols)
-        tone = tones[begin[tree] + (row + strip.start) * side[tree] + col]
-        canvas.height_m[strip].reshape(-1)[at] = (seen[strip].ravel()[at] >> _HALF).astype(np.uint32).view(np.float32)
+        tone = tones[first[tree] + (row + strip.start) * stand.side[tree] + col]
+        canvas.height_m[strip].reshape(-1)[at] = height_m.ravel()[at].astype(np.uint32).view(np.float32)
         canvas.kind[strip].reshape(-1)[at] = CROWN
         canvas.owner[strip].reshape(-1)[at] = 0
         canvas.colour[strip].reshape(-1, 3)[at] = np.clip(tone[:, None] * colour[tree], 0, 255)
+
+
+def _highest(canvas: Canvas, stand: _Stand) -> NDArray[np.uint64]:
+    """Return for each cell the highest thing: the bits of its height, and in the lower half of the number whose it is.
+
+    A height that is not negative sorts by the bits of its float32. Of equal heights that of what stands there already
+    is seen (`_NO_TREE`), or that of the first tree, whose number counts down. So the order of trees does not matter.
+    """
+    found = (canvas.height_m + np.float32(0)).view(np.uint32).astype(np.uint64) << _HALF | _NO_TREE
+    is_bare, height_m = stand.is_bare, stand.trees.height_m.astype(np.float32)
+    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3 if is_bare.any() else np.ones((1, 1), dtype=bool)
+    for kind, crown in enumerate(stand.crowns):
+        own = np.flatnonzero((stand.number == kind) & stand.fits)
+        row, col = np.nonzero(crown.height)
+        for trees in np.array_split(own, 1 + len(own) * len(row) // _AT_ONCE):
+            cell = (stand.corner[trees] @ (canvas.grid.cols, 1))[:, None] + (row * canvas.grid.cols + col)
+            key = (crown.height[row, col] * height_m[trees, None]).view(np.uint32).astype(np.uint64) << _HALF
+            key |= (_NO_TREE - 1 - trees.astype(np.uint64))[:, None]
+            if is_bare[trees].any():
+                key[is_bare[trees, None] & ~twigs.ravel()[cell]] = 0
+            np.maximum.at(found.ravel(), cell.ravel(), key.ravel())
+    return found
 
 
 def _in_turn(groups: Sequence[Trees]) -> Trees:

@@ -209,7 +209,7 @@ def made(folder: Path, levels: Path) -> list[float]:
         def from_levels(part: Region = part) -> None:
             """Copy the cells."""
             row, col = stored.grid.to_cells(np.array([[part.grid.west_m, part.grid.north_m]]))[0].tolist()
-            np.array(stored.level(1).cells[row : row + part.grid.rows, col : col + part.grid.cols])
+            np.array(stored.level(1).cells.cut(row, col, part.grid.shape).fours)
 
         def from_vectors(part: Region = part) -> None:
             """Burn the layers."""

@@ -7,10 +7,10 @@
 Checks both commits out below `--into`, makes an environment for each by its own `make install`, and runs each row in
 each of them in turn, base first: A B A B. What a row needs (regions, tasks) each commit makes for itself, once. Seconds
 are by the clock, `CPU s` are of a command and of all that it waited for, memory is that of its largest process; rows of
-`profile` give what it measured of the matcher. A ratio is head over base. Other load is in the seconds of both alike,
-and least in `CPU s`: quote ratios of one run. A row that one of the commits cannot carry out says so; rows that were
-measured are kept, and the same command goes on with the others. Needs the extracts of Liechtenstein, Andorra and the
-Faroes in a folder that SASGEO_EXTRACTS names.
+`profile` give what it measured of the matcher, that of Andorra what `search_countries.py` prints. A ratio is head over
+base. Other load is in the seconds of both alike, and least in `CPU s`: quote ratios of one run. A row that one of the
+commits cannot carry out says so; rows that were measured are kept, and the same command goes on with the others. Needs
+the extracts of Liechtenstein, Andorra and the Faroes in a folder that SASGEO_EXTRACTS names.
 """
 
 import argparse
@@ -22,17 +22,22 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 HERE: Final = Path(__file__).resolve().parents[1]
 FRESH: Final = "{fresh}"  # a folder that is emptied before each run
 KEPT: Final = "{kept}"  # a folder of the commit, in which its regions and tasks stay
+BASE: Final = "{base}"  # the checkout of the base: both commits score its stored boards
 PLACES: Final = {  # name -> region whose extracts it has, and what its file says otherwise
     "square": ("vaduz", {"id": '"square"', "size_m": "[12288, 12288]"}),
-    "faroes": ("torshavn", {"id": '"faroes"', "center_lonlat": "[-6.97, 61.895]", "size_m": "[81920, 120832]"}),
+    "faroes": (
+        "torshavn",
+        # Cells of 2 m: a region file may not ask for as many as of 1 m
+        {"id": '"faroes"', "center_lonlat": "[-6.97, 61.895]", "size_m": "[81920, 120832]", "cell_size_m": "2.0"},
+    ),
 }
 VADUZ: Final = ("build-region", "vaduz", "--out", KEPT)
 
@@ -46,14 +51,16 @@ def drawn(suite: str, *, sites: int) -> tuple[str, ...]:
 class Row:
     """A command of the program, or a program of ours (`*.py`), and what must be there before.
 
-    `is_profile` takes figures from `profile.json` in place of those of the process.
+    `gives` takes figures from the folder `FRESH` and from what the program prints, in place of those of the process.
+    `anew` is removed before each run.
     """
 
     name: str
     words: tuple[str, ...]
     first: tuple[tuple[str, ...], ...] = ()
     goal: float | None = None
-    is_profile: bool = False
+    gives: Callable[[Path, str], dict[str, float]] | None = None
+    anew: str = ""
 
 
 def profiled(name: str, matcher: str, *, goal: float, suite: str = "clean") -> Row:
@@ -71,7 +78,43 @@ def profiled(name: str, matcher: str, *, goal: float, suite: str = "clean") -> R
         "20",
     )
     first = (VADUZ, drawn(suite, sites=3))
-    return Row(name=name, words=(*words, "--into", FRESH, *asked), first=first, goal=goal, is_profile=True)
+    return Row(name=name, words=(*words, "--into", FRESH, *asked), first=first, goal=goal, gives=of_profile)
+
+
+def of_profile(fresh: Path, _: str) -> dict[str, float]:
+    """Return the figures of a profile."""
+    found = json.loads(next(fresh.rglob("profile.json")).read_text())
+    fixes = [fix for fix in found["fixes"] if fix["status"] == "ok"]
+    times = sorted(fix["seconds"] for fix in fixes)
+    return {
+        "p50 s": statistics.median(times),
+        "p95 s": times[int(0.95 * (len(times) - 1))],
+        "CPU s": statistics.median(fix["cpu_s"] for fix in fixes),
+        "start s": float(found["start_s"]),
+        "prepare s": float(found["prepare_s"]),
+        "MB": float(found["peak_bytes"]) / 1e6,
+    }
+
+
+def of_country(_: Path, said: str) -> dict[str, float]:
+    r"""Return the figures that `search_countries.py` prints of a fix on two cores and of storing the levels.
+
+    >>> fix = "| andorra | 558 | stored | 2 | 0.91 | 140 | 5.40 | 9.80 | 900 | 7 of 7 |  |  |"
+    >>> stored = "| andorra | 80.1 | 76.0 | 1.0 | 2.0 | 3.0 | 4.0 | 5.0 | 6.0 |"
+    >>> of_country(Path(), f"{fix}\n{stored}")["stored in s"]
+    80.1
+    """
+    rows = [[cell.strip() for cell in line.strip("|\n ").split("|")] for line in said.splitlines() if line[:1] == "|"]
+    fix = next(row for row in rows if row[2:4] == ["stored", "2"])
+    stored = next(row for row in reversed(rows) if len(row) == 9)
+    names = {"fix s": fix[6], "fix CPU s": fix[7], "ready s": fix[4], "MB": fix[8]}
+    return {name: float(text) for name, text in (names | {"stored in s": stored[1], "CPU s": stored[2]}).items()}
+
+
+def scored(matchers: int, queries: int) -> Row:
+    """Return the row that scores made-up answers with rejectors and all figures."""
+    words = ("benchmarks/score.py", "--sizes", f"{matchers}x{queries}", "--runs", "1", "--keep", f"{KEPT}/made-up")
+    return Row(name=f"score {matchers * queries:,} rows", words=words, first=(words,), goal=0.3)
 
 
 ROWS: Final = (
@@ -95,9 +138,24 @@ ROWS: Final = (
     ),
     Row(name="render", words=("benchmarks/rendering.py", "--out", KEPT), goal=0.4),
     Row(
-        name="score 10^5 rows",
-        words=("benchmarks/score.py", "--sizes", "10x10000", "--runs", "1", "--keep", f"{KEPT}/made-up"),
-        first=(("benchmarks/score.py", "--sizes", "10x10000", "--runs", "1", "--keep", f"{KEPT}/made-up"),),
+        name="Andorra",
+        words=("-m", "benchmarks.search_countries", "--out", KEPT, "--regions", "andorra", "--ways", "stored"),
+        first=(("build-region", "andorra", "--out", KEPT),),
+        goal=0.46,
+        gives=of_country,
+        anew=f"{KEPT}/levels",
+    ),
+    Row(
+        name="score modules",
+        words=("score", "--predictions", f"{BASE}/docs/results/modules", "--out", FRESH),
+        goal=0.35,
+    ),
+    scored(10, 10_000),
+    scored(20, 50_000),
+    Row(
+        name="enter demo",
+        words=("enter", f"{KEPT}/results/demo", "--matcher", "polar", "--out", FRESH, "--into", f"{FRESH}/mine"),
+        first=(("leaderboard", "demo", "--out", KEPT, "--results", f"{KEPT}/results"),),
         goal=0.3,
     ),
     Row(name="make demo", words=("make", "demo"), goal=0.6),
@@ -111,11 +169,12 @@ class Checkout:
 
     name: str
     root: Path
+    base: Path
 
     @classmethod
-    def of(cls, name: str, commit: str, into: Path) -> "Checkout":
+    def of(cls, name: str, commit: str, into: Path, *, base: Path) -> "Checkout":
         """Check a commit out and install it, unless that is done."""
-        made = cls(name, into / name)
+        made = cls(name, into / name, base)
         if not made.root.exists():
             git("worktree", "add", "--force", "--detach", str(made.root), commit)
         if not (made.root / ".venv" / "installed").exists():
@@ -139,52 +198,42 @@ class Checkout:
         """Carry out a row once; return its figures by name."""
         fresh = self.root.parent / f"{self.name}-fresh"
         shutil.rmtree(fresh, ignore_errors=True)
+        if row.anew:
+            shutil.rmtree(self._word(row.anew, fresh), ignore_errors=True)
         begun = time.perf_counter()
-        process = self._begin(row.words, fresh)
-        _, status, usage = os.wait4(process.pid, 0)
+        said = self.root.parent / f"{self.name}.out"
+        with said.open("wb") as into:
+            process = self._begin(row.words, fresh, into)
+            _, status, usage = os.wait4(process.pid, 0)
         seconds = time.perf_counter() - begun
         if status:
             raise subprocess.CalledProcessError(os.waitstatus_to_exitcode(status), row.words)
-        if row.is_profile:
-            return of_profile(json.loads(next(fresh.rglob("profile.json")).read_text()))
+        if row.gives:
+            return row.gives(fresh, said.read_text(encoding="utf-8"))
         return {"s": seconds, "CPU s": usage.ru_utime + usage.ru_stime, "MB": usage.ru_maxrss * 1024 / 1e6}
 
     def prepare(self, row: Row) -> None:
         """Make what a row needs."""
         for words in row.first:
-            process = self._begin(words, self.root.parent / f"{self.name}-fresh")
+            with (self.root.parent / f"{self.name}.out").open("wb") as into:
+                process = self._begin(words, self.root.parent / f"{self.name}-fresh", into)
             if process.wait():
                 raise subprocess.CalledProcessError(process.returncode, words)
 
-    def _begin(self, words: Sequence[str], fresh: Path) -> "subprocess.Popen[bytes]":
-        given = [word.replace(FRESH, str(fresh)).replace(KEPT, str(self.kept)) for word in words]
+    def _word(self, word: str, fresh: Path) -> str:
+        return word.replace(FRESH, str(fresh)).replace(KEPT, str(self.kept)).replace(BASE, str(self.base))
+
+    def _begin(self, words: Sequence[str], fresh: Path, into: IO[bytes]) -> "subprocess.Popen[bytes]":
+        given = [self._word(word, fresh) for word in words]
         binaries = self.root / ".venv" / "bin"
-        if given[0].endswith(".py"):
+        if given[0].endswith(".py") or given[0] == "-m":
             given = [str(binaries / "python"), *given]
         elif given[0] != "make":
             given = [str(binaries / "sasgeo-bench"), *given]
         path = {"PATH": f"{binaries}:{os.environ['PATH']}", "PYTHONPATH": str(self.root)}
-        said = (self.root.parent / f"{self.name}.log").open("ab")
-        return subprocess.Popen(given, cwd=self.root, env=os.environ | path, stdout=said, stderr=said)  # noqa: S603 - our own programs
-
-
-def of_profile(found: Mapping[str, object]) -> dict[str, float]:
-    """Return the figures of a profile.
-
-    >>> fixes = [{"status": "ok", "seconds": 0.2, "cpu_s": 0.1}] * 20
-    >>> of_profile({"fixes": fixes, "start_s": 1.0, "prepare_s": 2.0, "peak_bytes": 3e8})["p95 s"]
-    0.2
-    """
-    fixes = [fix for fix in found["fixes"] if fix["status"] == "ok"]  # type: ignore[attr-defined]
-    times = sorted(fix["seconds"] for fix in fixes)
-    return {
-        "p50 s": statistics.median(times),
-        "p95 s": times[int(0.95 * (len(times) - 1))],
-        "CPU s": statistics.median(fix["cpu_s"] for fix in fixes),
-        "start s": float(str(found["start_s"])),
-        "prepare s": float(str(found["prepare_s"])),
-        "MB": float(str(found["peak_bytes"])) / 1e6,
-    }
+        path["PYTHONDONTWRITEBYTECODE"] = ""  # as with a user, modules are compiled once
+        with (self.root.parent / f"{self.name}.log").open("ab") as log:
+            return subprocess.Popen(given, cwd=self.root, env=os.environ | path, stdout=into, stderr=log)  # noqa: S603 - our own programs
 
 
 def git(*words: str) -> str:
@@ -237,7 +286,8 @@ def main() -> None:
     into = asked.into.resolve()
     into.mkdir(parents=True, exist_ok=True)
     commits = {"base": git("rev-parse", asked.base), "head": git("rev-parse", asked.head)}
-    sides = {name: Checkout.of(f"{name}-{commit[:8]}", commit, into) for name, commit in commits.items()}
+    base = into / f"base-{commits['base'][:8]}"
+    sides = {name: Checkout.of(f"{name}-{commit[:8]}", commit, into, base=base) for name, commit in commits.items()}
     kept = into / f"{commits['base'][:8]}-{commits['head'][:8]}.json"
     found = json.loads(kept.read_text()) if kept.exists() else {}
     for row in ROWS:

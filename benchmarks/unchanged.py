@@ -14,6 +14,11 @@ publishes one. With --quick it builds and draws alone.
 A fingerprint is a SHA-256, and its name begins with its kind: `file` of bytes; `table` of a column of a table, for each
 matcher by itself where there are several; `words` of a text in which hashes, and where times are in it all numbers, are
 left out. So what goes is named column by column and matcher by matcher, and `--kinds table file` passes over words.
+
+Where a change may move the last bits of a number, name the folder of before as well: a column of numbers that are as
+near as `--tolerance` is then the same.
+
+    python benchmarks/unchanged.py --out after --against before.json --near before --tolerance 0.001
 """
 
 import argparse
@@ -27,6 +32,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import pandas as pd
 
 KINDS: Final = ("file", "table", "words")
@@ -157,6 +163,20 @@ def _columns(name: str, table: pd.DataFrame, *, is_measured: bool) -> Prints:
             yield f"table: {name}: {matcher}: {column}".replace(": :", ":"), _sha256(text.encode())
 
 
+def _is_near(name: str, before: Path, after: Path, *, tolerance: float) -> bool:
+    """Return whether a column, by the name of its fingerprint, holds nearly the same numbers in two folders."""
+    kind, path, *of_matcher, column = name.split(": ")
+    if kind != "table" or not all((root / path).is_file() for root in (before, after)):
+        return False
+    tables = [pd.read_parquet(root / path) for root in (before, after)]
+    if of_matcher:
+        tables = [table[table["matcher"] == of_matcher[0]] for table in tables]
+    one, two = (table[column].to_numpy() for table in tables)
+    if len(one) != len(two) or not all(np.issubdtype(values.dtype, np.floating) for values in (one, two)):
+        return False
+    return bool(np.allclose(one, two, rtol=tolerance, atol=tolerance, equal_nan=True))
+
+
 def _masked(text: str, *, is_measured: bool) -> str:
     text = _HASH.sub("#", text)
     return _NUMBER.sub("0", text) if is_measured else text
@@ -176,6 +196,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="an empty folder")
     parser.add_argument("--record", type=Path, help="JSON file to write")
     parser.add_argument("--against", type=Path, help="JSON file that was recorded before")
+    parser.add_argument("--near", type=Path, help="the --out of before: numbers as near as --tolerance are the same")
+    parser.add_argument("--tolerance", type=float, default=1e-3, help="of --near, in units of the column and relative")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="of fingerprints to compare")
     parser.add_argument("--quick", action="store_true", help="regions and queries alone")
     words = parser.parse_args()
@@ -188,6 +210,10 @@ def main() -> None:
     before = json.loads(words.against.read_text(encoding="utf-8")) if words.against else found
     names = {name for name in before.keys() | found.keys() if name.partition(":")[0] in words.kinds}
     changed = sorted(name for name in names if before.get(name) != found.get(name))
+    if words.near:
+        near = {name for name in changed if _is_near(name, words.near, words.out, tolerance=words.tolerance)}
+        changed = [name for name in changed if name not in near]
+        print(f"{len(near)} columns differ by less than {words.tolerance:g}")
     for name in changed:
         print(f"{name}: {'changed' if name in before and name in found else 'gone' if name in before else 'new'}")
     print(f"{len(names)} fingerprints, {len(changed)} changed")

@@ -48,6 +48,7 @@ settings.register_profile("quick", settings.get_profile("sasgeo"), max_examples=
 settings.register_profile("search", settings.get_profile("sasgeo"), derandomize=False, max_examples=200)
 settings.load_profile("sasgeo")
 gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of that time
+os.environ["SASGEO_KEPT_MB"] = "0"  # no test reads or writes what the user keeps of maps (tests/running/test_kept.py)
 progress.EVERY_S = math.inf  # else lines of progress come between others wherever the machine is slow
 
 BUILDERS = ("test_build.py", "test_cli.py", "test_results.py", "test_town.py")  # build or start something in each test

@@ -42,9 +42,10 @@ def textured(seed: int, side: int = SIDE) -> np.ndarray:
 class MadeUp(SimpleNamespace):
     """What matchers read of a region."""
 
-    read_layer = None
+    read_layer = keep = None
     layer = Region.layer
     known = Region.known
+    kept = Region.kept
 
 
 def error_m(answer, pose=HERE):

@@ -11,7 +11,6 @@ from sasgeo_bench import Chart, DenseMatcher, Evidence, MatcherCard, Region, Vot
 
 # A place of which the map knows half would be judged by half of the view, whose covariance varies more.
 LEAST_OVERLAP: Final = 0.9
-_FULL: Final = 255
 
 
 def soft_template(chances: NDArray[np.float64], shares: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -84,9 +83,7 @@ class RasterSoft(DenseMatcher):
     def read(self, region: Region) -> Chart:
         """Return the map with the proximity of its lines; note the share of each layer."""
         chart = Chart.of(region, thin=THIN, reach_m=REACH_M)
-        is_known = chart.known > 0
-        for name, layer in zip(chart.classes, chart.degree, strict=True):
-            self._shares[name] = float(layer[is_known].mean()) / _FULL if is_known.any() else 0.0
+        self._shares = dict(zip(chart.classes, chart.shares().tolist(), strict=True))
         return chart
 
     def template(self, evidence: Evidence) -> NDArray[np.float64]:

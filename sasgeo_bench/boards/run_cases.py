@@ -29,7 +29,7 @@ from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.layers import read_layers
-from sasgeo_bench.running.prediction_files import CANDIDATE_M, RUN, Answers, RunManifest, read_ties
+from sasgeo_bench.running.prediction_files import CANDIDATE_M, Answers, RunManifest, read_ties
 from sasgeo_bench.sasgeo.integrity import EVIDENCE
 from sasgeo_bench.scoring.controls import is_control
 from sasgeo_bench.scoring.entries import Entry, find_entries
@@ -255,12 +255,6 @@ def root_of(run: Path, out: Path) -> Path:
     """Return the folder of tasks, truths and regions of a run: next to its runs/, unless given."""
     above = (folder.parent for folder in run.resolve().parents if folder.name == "runs")
     return next((root for root in above if (root / "tasks").is_dir()), out)
-
-
-def is_run(folder: Path) -> bool:
-    """Return True if a folder is a run, or holds those of a matcher."""
-    patterns = (RUN, f"*/*/{RUN}", f"*/*/*/{RUN}")
-    return any(next(folder.glob(pattern), None) is not None for pattern in patterns)
 
 
 def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequence[str] = ()) -> RunCases:

@@ -19,6 +19,7 @@ from sasgeo_bench.cli.options import ExtractFolders, Out
 from sasgeo_bench.core.errors import ExtractError, named
 from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, Extract, answers, extract_folders, find_extract
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from sasgeo_bench.running.kept import VARIABLE, kept_folder, most_bytes
 
 _LIBRARIES: Final = ("osmium", "shapely", "geopandas", "rasterio", "numpy", "pandas", "pyarrow")
 
@@ -46,6 +47,8 @@ def examine(folders: Sequence[Path], *, out: Path) -> Iterator[tuple[str, str]]:
     is_writable = os.access(root, os.W_OK)
     free_gb = shutil.disk_usage(root).free / 1e9
     yield "output", f"{out.absolute()}, {free_gb:.1f} GB free" + ("" if is_writable else ", NOT WRITABLE")
+    kept_mb = sum(path.stat().st_size for path in kept_folder().glob("*/*/*") if path.is_file()) / 1e6
+    yield "kept of maps", f"{kept_folder()}, {kept_mb:.0f} MB of {most_bytes() / 1e6:.0f} ({VARIABLE})"
     yield from _missing(folders)
 
 

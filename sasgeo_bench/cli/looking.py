@@ -1,47 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that look at what was made, and hold it against what it should be."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
-import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.boards.board_files import BOARD, read_board_manifest, read_scores
-from sasgeo_bench.boards.cases import case_pixels, count_cases, sample_cases, turned_line, write_png
-from sasgeo_bench.boards.flight_page import flight_page
-from sasgeo_bench.boards.flight_plots import flight_map_pixels
-from sasgeo_bench.boards.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
-from sasgeo_bench.boards.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.cli.built_regions import find_built
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
-from sasgeo_bench.cli.targets import find_task, is_split, no_target
-from sasgeo_bench.core.errors import ConfigError, counted
-from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.cli.targets import find_task, is_split, sheet_path
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
-from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.scoring.rows import base_name
-from sasgeo_bench.scoring.strata import STRESS
-from sasgeo_bench.tasks.query import BY, SEQUENCE_DIGITS
-from sasgeo_bench.tasks.sheet import flight_panels, panels_of, write_flight_sheet, write_sheet
+from sasgeo_bench.running.prediction_files import is_run
+from sasgeo_bench.tasks.query import SEQUENCE_DIGITS
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
-from sasgeo_bench.tasks.split_map import write_split_map
 from sasgeo_bench.tasks.task_files import Task
 
 TOP_DROPS: Final = 12
-SOME_CASES: Final = 3
-_NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9.@+_-]+")
-SHOWN_LETTERS: Final = 10  # of a query's id: enough to name it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,15 +66,22 @@ def inspect_command(
         _refuse_strip(target, options.strip)
         _inspect_task(Task.open(task_folder, out), out, query=query, rows=options.rows)
         return
-    if options.strip is not None and (Path(target) / BOARD).is_file():
-        target = str(_best_run(Path(target), out))
+    if options.strip is not None:
+        from sasgeo_bench.cli.looking_runs import run_of  # noqa: PLC0415 - boards take a second to import
+
+        target = str(run_of(Path(target), out))
     if Path(target).is_dir() and is_run(Path(target)):
+        from sasgeo_bench.boards.run_cases import read_run_cases  # noqa: PLC0415 - as above
+        from sasgeo_bench.cli.looking_runs import inspect_run  # noqa: PLC0415
+
         grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
         chosen = make_split(read_split_file(find_split_file(options.split)), grids)
         cases = read_run_cases(Path(target), out=out, split=chosen, rejectors=options.rejector or ())
-        _inspect_run(cases, out, query, options.strip)
+        inspect_run(cases, out, query, options.strip)
         return
     if region_folder is None and not is_split(target):
+        from sasgeo_bench.cli.no_target import no_target  # noqa: PLC0415 - looks for all that it might be
+
         raise no_target(target, out, folders)
     _refuse_strip(target, options.strip)
     if query is not None:
@@ -116,7 +106,10 @@ def _preview(manifest: Manifest, folder: Path, out: Path) -> Path:
     """Return the picture of a map: that of the build, or one drawn now, for maps on the way to queries have none."""
     if PREVIEW in manifest.files:
         return folder / PREVIEW
-    path = _sheet(out, "map", folder.name)
+    from sasgeo_bench.regions.layers import PREVIEW_CELLS, read_overview  # noqa: PLC0415 - imports GDAL
+    from sasgeo_bench.regions.preview import write_preview  # noqa: PLC0415
+
+    path = sheet_path(out, "map", folder.name)
     path.parent.mkdir(parents=True, exist_ok=True)
     overview = read_overview(folder / LAYERS, longest_cells=PREVIEW_CELLS)
     write_preview(path, manifest=manifest, overview=overview)
@@ -131,30 +124,23 @@ def _refuse_strip(target: str, strip: int | None) -> None:
 
 def _inspect_task(task: Task, out: Path, *, query: str | None, rows: int) -> None:
     """Print what a task is and draw its contact sheet; of flights, maps of their paths, unless a view is named."""
+    from sasgeo_bench.tasks import sheet  # noqa: PLC0415 - what draws takes half a second to import
+
     about = task.manifest
-    path = _sheet(out, *about.name, *([query] if query else []))
+    path = sheet_path(out, *about.name, *([query] if query else []))
     is_of_view = query is not None and len(query) > SEQUENCE_DIGITS
-    maps = flight_panels(task, count=rows, flight=query) if about.is_of_flights and not is_of_view else ()
-    chosen = () if maps else panels_of(task, count=rows, query_id=query)
+    maps = sheet.flight_panels(task, count=rows, flight=query) if about.is_of_flights and not is_of_view else ()
+    chosen = () if maps else sheet.panels_of(task, count=rows, query_id=query)
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in about.to_json().items():
         table.add_row(name, _text_of(value))
     print_table(table)
     path.parent.mkdir(parents=True, exist_ok=True)
     if maps:
-        write_flight_sheet(path, task, maps)
+        sheet.write_flight_sheet(path, task, maps)
     else:
-        write_sheet(path, title=f"{about.title}: {about.region}", panels=chosen, credit=about.provenance.credit)
+        sheet.write_sheet(path, title=f"{about.title}: {about.region}", panels=chosen, credit=about.provenance.credit)
     say(f"contact sheet: {path}")
-
-
-def _sheet(out: Path, *names: str) -> Path:
-    """Return where a picture is written; names of tasks and queries may come from elsewhere, and lead nowhere else.
-
-    >>> _sheet(Path("out"), "mine 2", "../../x").as_posix()
-    'out/sheets/mine-2-..-..-x.png'
-    """
-    return out / "sheets" / f"{_NOT_IN_NAMES.sub('-', '-'.join(names))}.png"
 
 
 def _text_of(value: object) -> str:
@@ -164,102 +150,12 @@ def _text_of(value: object) -> str:
     return ", ".join(map(_text_of, value)) if isinstance(value, list) else str(value)
 
 
-def _best_run(board: Path, out: Path) -> Path:
-    """Return the folder of the runs of the matcher of a board that finds most queries with pictures."""
-    about = read_board_manifest(board)
-    scores = {str(name): frame for name, frame in read_scores(board).groupby("matcher")}
-    tasks = {(item.suite, item.region) for item in about.tasks}
-    name = best_on_pictures(scores, {key for key in tasks if BY in key[0]})
-    if name is None:
-        raise ConfigError(
-            f"{board} holds no answers to queries with pictures: name a board of a suite such as aerial+..."
-        )
-    entry = next(item for item in about.entries if item.name == name)
-    return out / "runs" / base_name(entry.name) / str(entry.hash)
-
-
-def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | None) -> None:
-    """Count the failures of a run by class, with some to look at; or draw one query and its answer, or a strip.
-
-    Of flights print what each is scored, and draw the map of one.
-    """
-    if cases.flights and strip is None and _inspect_flights(cases, out, query):
-        return
-    if strip is not None:
-        suites = ", ".join(sorted({suite for suite, _ in pictured_tasks(cases)}))
-        path = _sheet(out, "strip", cases.entry.name)
-        write_png(path, strip_pixels(*strip_of(cases, strip), title=f"{cases.entry.name} on {suites}"))
-        say(f"strip: {path}")
-        return
-    if query is not None:
-        query_id, picture = picture_of(cases, query)
-        path = _sheet(out, cases.entry.name, query_id)
-        write_png(path, case_pixels(picture))
-        say(f"picture: {path}")
-        return
-    if not len(cases.scores):
-        return
-    found = cases.failures()
-    counts = count_cases(found)
-    some = sample_cases(found, each=SOME_CASES)
-    table = Table("failure", "queries", "some of them (--query draws one)", box=None, pad_edge=False)
-    for name, count in counts.items():
-        listed = some.loc[some["failure"] == name, "query_id"]
-        table.add_row(name, str(count), ", ".join(query_id[:SHOWN_LETTERS] for query_id in listed))
-    stressed, total = int((cases.scores["role"] == STRESS).sum()), len(cases.scores)
-    only = f", {stressed} of the queries under stress: boards count these first, and controls apart" if stressed else ""
-    say(f"{cases.entry.name}: {counted(len(found), 'failure')} in {counted(total, 'query', 'queries')}{only}")
-    print_table(table)
-    if turned := turned_line(cases.scores):
-        say(turned)
-
-
-def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
-    """Print the figures of the flights of a run, and draw a map of the one named, or of the worst.
-
-    Return True if `query` names one of them.
-    """
-    frames = [found.flights for found in cases.flights.values()]
-    order = ["distance_within_25m", "role", "query_id"]  # of flights that are as good the stressed first
-    flights = pd.concat(frames, ignore_index=True).sort_values(order, ascending=[True, False, True])
-    if query is None:
-        _print_flights(cases.entry.name, flights)
-        row = flights.iloc[0]
-    else:
-        flight = find_flight(cases, query)
-        if flight is None:
-            return False
-        row = flights[flights["query_id"] == flight].iloc[0]
-    key = (str(row["suite"]), str(row["region"]))
-    task = Task.open(cases.root / "tasks" / key[0] / key[1], cases.root)
-    views = {cases.entry.name: cases.flights[key].views}
-    path = _sheet(out, cases.entry.name, str(row["query_id"]))
-    write_png(path, flight_map_pixels(task, str(row["query_id"]), views))
-    say(f"map of {'the worst flight' if query is None else 'the flight'}: {path}")
-    playing = path.with_suffix(".html")
-    text = flight_page(task, str(row["query_id"]), cases.entry.name, cases.flights[key].views, cases.predictions)
-    with fresh_file(playing, mend="name another --out, or free some space") as scratch:
-        scratch.write_text(text, encoding="utf-8")
-    say(f"page that plays it: {playing}")
-    return query is not None
-
-
-def _print_flights(name: str, flights: pd.DataFrame) -> None:
-    """Print a line for each flight, the worst first."""
-    shown = {"flight": "query_id", "suite": "suite", "region": "region", "kind": "kind", "status": "status"}
-    figures = ("distance_within_25m", "right_accepted", "false_accepted", "error_p95_m", "first_fix_m")
-    table = Table(*shown, *figures, box=None, pad_edge=False)
-    for row in flights.to_dict("records"):
-        texts = [str(row["query_id"])[:SHOWN_LETTERS], *(str(row[column]) for column in list(shown.values())[1:])]
-        table.add_row(*texts, *(f"{row[figure]:.3g}" for figure in figures))
-    say(f"{name}: {counted(len(flights), 'flight')}, the worst first (--query draws one)")
-    print_table(table)
-
-
 def _inspect_split(target: str, out: Path, folders: list[Path]) -> None:
     """Print the places of a split and draw their map."""
     grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
     split = make_split(read_split_file(find_split_file(target)), grids)
+    from sasgeo_bench.tasks.split_map import write_split_map  # noqa: PLC0415 - imports matplotlib
+
     say(split.to_text())
     path = out / "sheets" / f"split-{split.spec.id}.png"
     path.parent.mkdir(parents=True, exist_ok=True)

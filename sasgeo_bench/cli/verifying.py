@@ -7,22 +7,17 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.boards.archive import laid_tasks
-from sasgeo_bench.boards.run_cases import is_run
 from sasgeo_bench.cli.built_regions import find_built
 from sasgeo_bench.cli.console import EXIT_USER, complain, say, shown_progress
 from sasgeo_bench.cli.options import Out, RegionFolders
-from sasgeo_bench.cli.targets import find_task, is_split, no_target
+from sasgeo_bench.cli.targets import find_task, is_split
 from sasgeo_bench.core.errors import ConfigError, counted, named
 from sasgeo_bench.core.progress import spread, tell
-from sasgeo_bench.exchange.submissions import hold_submission
 from sasgeo_bench.regions.packed_map import is_packed_map, unpack_map
 from sasgeo_bench.regions.region_files import differing_files, read_features
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.running.prediction_files import Violation, parts_of
+from sasgeo_bench.running.prediction_files import Violation, is_run, parts_of
 from sasgeo_bench.scoring.submission_files import count_excluded, is_submission, validate
-from sasgeo_bench.tasks.build import check_task
-from sasgeo_bench.tasks.duplicates import BLOCK, Arrangements, constellations, search_look_alikes, search_split
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.task_files import Task
 
@@ -57,6 +52,8 @@ def verify_command(
     if tasks and (task_folder is not None or region_folder is not None or is_split(target)):
         raise ConfigError(f"{target} holds no answers, and --tasks is what answers are held against: leave it out")
     if task_folder is not None:
+        from sasgeo_bench.tasks.build import check_task  # noqa: PLC0415 - drawing takes a second to import
+
         task = Task.open(task_folder, out)
         with_truths = "every query has its truth" if task.has_truths else "its truths are not here"
         faults, good = check_task(task), f"all files are as task.json says, and {with_truths}"
@@ -68,6 +65,8 @@ def verify_command(
         _verify_answers(Path(target), tasks or [])
         return
     else:
+        from sasgeo_bench.cli.no_target import no_target  # noqa: PLC0415 - looks for all that it might be
+
         raise no_target(target, out, region_folders or [])
     for line in faults:
         say(line)
@@ -83,6 +82,8 @@ def _size(target: str, out: Path) -> str:
 
 def _verify_answers(predictions: Path, tasks: list[Path]) -> None:
     """List everything in which predictions are not what the tasks ask for, and count queries without a row."""
+    from sasgeo_bench.boards.archive import laid_tasks  # noqa: PLC0415 - boards take a second to import
+
     if not tasks:
         raise ConfigError(f"{predictions} holds answers: name --tasks, task folders or the stored results of a board")
     with laid_tasks(tasks) as folders:
@@ -111,6 +112,8 @@ def _show(faults: Iterable[Violation], predictions: Path) -> None:
 
 def _verify_submission(folder: Path, tasks: list[Path]) -> None:
     """Validate a submission: queries without a row are no faults but misses, which are reported."""
+    from sasgeo_bench.exchange.submissions import hold_submission  # noqa: PLC0415 - as boards
+
     submission, found = hold_submission(folder, tasks)
     _show([fault for fault in found if not fault.is_missing_row], folder)
     missing = len(found)
@@ -124,6 +127,14 @@ def _verify_submission(folder: Path, tasks: list[Path]) -> None:
 
 def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[str], str]:
     """Ground that parts of a split share, and what was searched."""
+    from sasgeo_bench.tasks.duplicates import (  # noqa: PLC0415 - its trees take half a second to import
+        BLOCK,
+        Arrangements,
+        constellations,
+        search_look_alikes,
+        search_split,
+    )
+
     grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
     split = make_split(read_split_file(find_split_file(target)), grids)
     built = [region for region in split.spec.region_ids if (out / "regions" / region).is_dir()]

@@ -3,11 +3,10 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import geopandas as gpd
+import lazy_loader  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
-import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
@@ -15,15 +14,13 @@ from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.osm.features import SEA, check_features
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.layers import (
-    centroids,
-    delaunay_pairs,
-    find_bends,
-    groups_within,
-    long_sides,
-    touching_pairs,
-)
 from sasgeo_bench.regions.region import MapGraph
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+    import pandas as pd
+else:  # loaded when a graph is made; and so are the layers, with GDAL: a matcher that reads one may need neither
+    gpd, pd = lazy_loader.load("geopandas"), lazy_loader.load("pandas")
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -72,7 +69,7 @@ class Network:
         return np.bincount(self.ends[chosen].ravel(), minlength=len(self.vertices))
 
 
-def make_network(ways: gpd.GeoDataFrame) -> Network:
+def make_network(ways: "gpd.GeoDataFrame") -> Network:
     """Cut ways with the classes of `LAYERS` into segments that share the vertices of their layer.
 
     Areas among them (squares) are left out. A segment drawn by two ways of one layer counts once, and is visible if
@@ -335,7 +332,7 @@ BEND_STEP_M, BEND_SMOOTHING_M, BEND_WINDOW_M, BEND_TURN_DEG = 10.0, 60.0, 120.0,
 Bounds = tuple[float, float, float, float]
 
 
-def build_graph(features: gpd.GeoDataFrame, *, bounds_m: Bounds | None = None) -> MapGraph:
+def build_graph(features: "gpd.GeoDataFrame", *, bounds_m: Bounds | None = None) -> MapGraph:
     """Derive the graph of a feature table.
 
     Features that are not visible from above make no node, but roads connect through them. Nothing outside `bounds_m`
@@ -357,7 +354,7 @@ def build_graph(features: gpd.GeoDataFrame, *, bounds_m: Bounds | None = None) -
     return draft.finish(features.crs, bounds_m)
 
 
-def _sorted(features: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+def _sorted(features: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Sort rows by class, type and id, so that nothing below depends on the order they came in."""
     order = np.lexsort(
         [pd.Categorical(features[name]).codes for name in ("class", "osm_type")] + [features["osm_id"].to_numpy()]
@@ -406,7 +403,7 @@ class _Draft:
         nodes = gpd.GeoDataFrame(columns, geometry=gpd.GeoSeries(shapely.points(en_m[order]), crs=crs))
         return MapGraph(nodes=nodes, edges=self._finish_edges(new_id, en_m[order]))
 
-    def _finish_edges(self, new_id: Ints, en_m: Floats) -> pd.DataFrame:
+    def _finish_edges(self, new_id: Ints, en_m: Floats) -> "pd.DataFrame":
         code, source, target, length_m = (np.concatenate(part) for part in zip(*self._edges, strict=True))
         source, target = new_id[source], new_id[target]
         is_mutual = np.isin(code, [RELATIONS.index("adjacency"), RELATIONS.index("connectivity")])
@@ -438,7 +435,7 @@ class _Ways:
     height: Ints  # OSM layer; a bridge without one lies above the ground
 
 
-def _draw_ways(draft: _Draft, ways: gpd.GeoDataFrame, bounds_m: Bounds | None) -> None:
+def _draw_ways(draft: _Draft, ways: "gpd.GeoDataFrame", bounds_m: Bounds | None) -> None:
     names = ways["class"].to_numpy(dtype=object)
     level = ways["level"].to_numpy(dtype=np.int64)
     table = _Ways(
@@ -496,7 +493,7 @@ class _Stops:
         draft.add_edges("connectivity", node[here], node[there], at_m[there] - at_m[here])
 
 
-def _is_on_square(network: Network, ways: gpd.GeoDataFrame) -> Bools:
+def _is_on_square(network: Network, ways: "gpd.GeoDataFrame") -> Bools:
     shapes = np.asarray(ways.geometry.array)
     vertex = network.lookup(shapely.get_coordinates(shapes[shapely.get_dimensions(shapes) == AREA_DIMENSION]))
     return np.isin(np.arange(len(network.vertices)), vertex)
@@ -579,6 +576,8 @@ def _link_to_ends(draft: _Draft, roads: Chains, junction: Ints, nodes: Ints, seg
 
 
 def _add_bends(draft: _Draft, ways: _Ways, stops: _Stops) -> None:
+    from sasgeo_bench.regions.layers import find_bends  # noqa: PLC0415 - as pandas above
+
     chains, network = stops.chains[WATER], ways.network
     bends = find_bends(
         chains.en_m,
@@ -602,7 +601,14 @@ def _add_bends(draft: _Draft, ways: _Ways, stops: _Stops) -> None:
     stops.add(WATER, nodes, bends.line[seen], bends.at_m[seen])
 
 
-def _draw_buildings(draft: _Draft, buildings: gpd.GeoDataFrame, bounds_m: Bounds | None) -> None:
+def _draw_buildings(draft: _Draft, buildings: "gpd.GeoDataFrame", bounds_m: Bounds | None) -> None:
+    from sasgeo_bench.regions.layers import (  # noqa: PLC0415 - as pandas above
+        centroids,
+        delaunay_pairs,
+        groups_within,
+        long_sides,
+    )
+
     shapes = np.asarray(buildings.geometry.array)
     en_m = centroids(shapes)
     is_real = np.isfinite(en_m).all(axis=1) & _is_inside(en_m, bounds_m)
@@ -631,8 +637,10 @@ def _draw_buildings(draft: _Draft, buildings: gpd.GeoDataFrame, bounds_m: Bounds
     draft.add_edges("adjacency", *near.T)
 
 
-def _draw_areas(draft: _Draft, areas: gpd.GeoDataFrame) -> None:
+def _draw_areas(draft: _Draft, areas: "gpd.GeoDataFrame") -> None:
     """Add waters, greens, fields and car parks; those that touch or overlap are adjacent."""
+    from sasgeo_bench.regions.layers import centroids, touching_pairs  # noqa: PLC0415 - as pandas above
+
     shapes = np.asarray(areas.geometry.array)
     is_real = (shapely.get_dimensions(shapes) == AREA_DIMENSION) & ~shapely.is_empty(shapes)
     shapes, areas = shapes[is_real], areas[is_real]
@@ -647,7 +655,7 @@ def _draw_areas(draft: _Draft, areas: gpd.GeoDataFrame) -> None:
     draft.add_edges("adjacency", *nodes[pairs].T)
 
 
-def _typed(columns: Mapping[str, object], dtypes: Mapping[str, str]) -> pd.DataFrame:
+def _typed(columns: Mapping[str, object], dtypes: Mapping[str, str]) -> "pd.DataFrame":
     return pd.DataFrame({name: columns[name] for name in dtypes}).astype(dict(dtypes))
 
 

@@ -2,9 +2,11 @@
 """Region: grid, layers, graph, features, coverage and provenance; immutable."""
 
 import datetime as dt
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Self, TypeVar, cast
 
 import numpy as np
@@ -186,6 +188,11 @@ class Manifest(JsonDocument):
             cols=self.cols,
         )
 
+    @property
+    def digest(self) -> str:
+        """Return the SHA-256 of all that it states, the hashes of the files included."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+
     def of_part(self, grid: Grid) -> Self:
         """Return what describes a part of the map with the grid of that part; all else is about the whole map."""
         return self.model_copy(update={"bounds_m": grid.bounds_m, "rows": grid.rows, "cols": grid.cols})
@@ -250,7 +257,8 @@ class Region:
     `layers` is uint8 of shape (C, rows, cols), PRESENT, ABSENT or OUTSIDE, bands in the order of `classes`, read-only;
     `coverage` is the mapped area in the region's CRS. `features` and `graph` of a stored region are read when they are
     first asked for, and so may `layers` be: until then `read_layer`, given the number of a class, reads it alone.
-    `imagery` reads windows of the aerial imagery; None if there is none.
+    `imagery` reads windows of the aerial imagery; None if there is none. `keep` is asked by `kept`; a region that was
+    made of another one, as a part of it, has none.
     """
 
     manifest: Manifest
@@ -260,6 +268,7 @@ class Region:
     coverage: shapely.Geometry
     imagery: Imagery | None = None
     read_layer: Callable[[int], NDArray[np.uint8]] | None = None
+    keep: Callable[[str, Mapping[str, Any]], Path | None] | None = field(default=None, init=False, compare=False)
 
     @property
     def grid(self) -> Grid:
@@ -293,7 +302,15 @@ class Region:
 
     def within(self, area: shapely.Geometry) -> "Region":
         """Return the region with no mapped ground beyond an area in its CRS; its layers stay what they are, unread."""
-        return Region(**vars(self) | {"coverage": self.coverage.intersection(area)})
+        own = {name: value for name, value in vars(self).items() if name != "keep"}
+        return Region(**own | {"coverage": self.coverage.intersection(area)})
+
+    def kept(self, what: str, **settings: Any) -> Path | None:  # noqa: ANN401 - of JSON, as each kind needs
+        """Return the folder of what the program itself makes of this map by some settings, and keeps; None without one.
+
+        Whoever is given None makes it.
+        """
+        return None if self.keep is None else self.keep(what, settings)
 
     def layer(self, class_name: str) -> NDArray[np.uint8]:
         """Return the raster of one class, shape (rows, cols); no other is read, for a country's take a gigabyte."""

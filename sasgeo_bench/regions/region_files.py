@@ -28,7 +28,7 @@ from sasgeo_bench.core.parquet import (
     write_frame,
 )
 from sasgeo_bench.core.paths import given_path
-from sasgeo_bench.core.texts import json_text
+from sasgeo_bench.core.texts import json_text, message_of
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import check_features
 from sasgeo_bench.regions.imagery import ORTHO, Imagery
@@ -51,6 +51,7 @@ EDGES: Final = "edges.parquet"
 PREVIEW: Final = "preview.png"
 GROUP_ROWS: Final = 2**15  # of features or nodes that are read at once: a town has fewer
 _MEND: Final = "build the region again"
+_UTM: Final = frozenset((*range(32601, 32661), *range(32701, 32761)))  # codes of its zones, north and south
 
 
 def write_tables(
@@ -96,9 +97,6 @@ def read_manifest(folder: Path) -> Manifest:
         ...
     sasgeo_bench.core.errors.StoreError: nowhere holds no region.json: build the region first
     """
-    from pyproj import CRS  # noqa: PLC0415 - with GDAL and pandas the slowest import: only reading needs it
-    from pyproj.exceptions import CRSError  # noqa: PLC0415
-
     path = folder / MANIFEST
     if not path.is_file():
         raise StoreError(f"{folder} holds no {MANIFEST}: build the region first")
@@ -109,14 +107,42 @@ def read_manifest(folder: Path) -> Manifest:
         raise StoreError(f"{path} {stated}, this version reads {SCHEMA_VERSION}: {_MEND}")
     try:
         manifest = check_document(content, Manifest, source=MANIFEST)
-        _ = shapely.from_wkt(manifest.coverage.wkt), CRS.from_epsg(manifest.epsg)
+        shapely.from_wkt(manifest.coverage.wkt)
+        _check_epsg(manifest.epsg)
         _check_bounds(manifest)
-    except (ConfigError, GridError, CRSError, shapely.errors.ShapelyError) as error:
+    except (ConfigError, GridError, shapely.errors.ShapelyError) as error:
         raise StoreError(f"{path} is damaged ({str(error)[:200]}): {_MEND}") from error
     lost = [name for name in (LAYERS, FEATURES, NODES, EDGES) if name not in manifest.files]
     if lost:
         raise StoreError(f"{path} is damaged (its files lack {lost[0]}): {_MEND}")
     return manifest
+
+
+def _check_epsg(epsg: int) -> None:
+    """Refuse a code that EPSG does not know; it is asked about those alone that are no zone of UTM."""
+    if epsg in _UTM:
+        return
+    from pyproj import CRS  # noqa: PLC0415 - with GDAL and pandas the slowest import
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
+    try:
+        CRS.from_epsg(epsg)
+    except CRSError as error:
+        raise GridError(message_of(error)) from error
+
+
+def _check_shape(path: Path, shape: tuple[int, int, int]) -> None:
+    """Refuse a raster of other layers, rows or columns than the manifest says: arrays are made by these."""
+    from tifffile import TiffFile  # noqa: PLC0415 - reads a head in a tenth of the time that GDAL takes to import
+
+    try:
+        with TiffFile(path) as file:
+            page = file.pages.first
+            found = (page.samplesperpixel, page.imagelength, page.imagewidth)
+    except Exception as error:  # its errors are of many kinds
+        raise StoreError(f"{path} cannot be read ({message_of(error)[:200]}): {_MEND}") from error
+    if found != shape:
+        raise StoreError(f"{path} has layers, rows and columns {found}, its region {shape}: {_MEND}")
 
 
 def _check_bounds(manifest: Manifest) -> None:
@@ -160,13 +186,11 @@ def read_region(
     GridError
         If the bounds are no box, or lie beyond the map.
     """
-    from sasgeo_bench.regions.layers import check_shape, read_layers  # noqa: PLC0415 - imports GDAL
-
     folder = given_path(path)
     manifest = read_manifest(folder)
     for name in (LAYERS, FEATURES, NODES, EDGES):
         _check_file(folder / name, manifest.files[name])
-    check_shape(folder / LAYERS, (len(manifest.classes), manifest.rows, manifest.cols))
+    _check_shape(folder / LAYERS, (len(manifest.classes), manifest.rows, manifest.cols))
     coverage, window, box = shapely.from_wkt(manifest.coverage.wkt), None, None
     if bounds_m is not None:
         window = _window(manifest.grid, bounds_m)
@@ -174,13 +198,18 @@ def read_region(
         box = manifest.bounds_m
         coverage = shapely.intersection(coverage, shapely.box(*box))
 
+    def read(bands: tuple[int, ...] | None = None) -> "NDArray[np.uint8]":
+        from sasgeo_bench.regions.layers import read_layers  # noqa: PLC0415 - imports GDAL
+
+        return read_layers(folder / LAYERS, window=window, bands=bands)
+
     def layers() -> "NDArray[np.uint8]":
         with around():
-            return read_layers(folder / LAYERS, window=window)
+            return read()
 
     def layer(index: int) -> "NDArray[np.uint8]":
         with around_layer():
-            found: NDArray[np.uint8] = read_layers(folder / LAYERS, window=window, bands=(index,))[0]
+            found: NDArray[np.uint8] = read((index,))[0]
             return found
 
     def features() -> "gpd.GeoDataFrame":
@@ -197,7 +226,7 @@ def read_region(
 
     return Region(
         manifest=manifest,
-        layers=read_layers(folder / LAYERS, window=window) if with_layers else layers,
+        layers=read() if with_layers else layers,
         features=features,
         graph=graph,
         coverage=coverage,

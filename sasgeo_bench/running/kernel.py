@@ -152,7 +152,7 @@ def around(path: str, hidden: Sequence[str]) -> Iterator[tuple[str, int]]:
     for name in names:
         inner = f"{real.rstrip('/')}/{name}"
         if not os.path.islink(inner):  # noqa: PTH114 - no pathlib before the sandbox is closed
-            yield from around(inner, hidden)
+            yield from around(inner, inside)
 
 
 _SECCOMP: Final = {"x86_64": 317, "aarch64": 277}

@@ -604,6 +604,12 @@ def end_round(run: Path) -> None:
     (run / ROUND).unlink(missing_ok=True)
 
 
+def is_run(folder: Path) -> bool:
+    """Return True if a folder is a run, or holds those of a matcher."""
+    patterns = (RUN, f"*/*/{RUN}", f"*/*/*/{RUN}")
+    return any(next(folder.glob(pattern), None) is not None for pattern in patterns)
+
+
 def parts_of(path: Path) -> list[Path]:
     """Return the files of a run in the order they were written, or of all runs in a folder, or the file itself."""
     if path.is_file():

@@ -6,10 +6,9 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
-import psutil
 
 from sasgeo_bench.core.errors import MatchError
 from sasgeo_bench.matching.follower import Follower
@@ -46,10 +45,20 @@ class Server(PluginServer[Matcher | Tracker]):
         maps = Maps({name: Path(folder) for name, folder in regions.items()})
         return self._learned(Training(regions=maps, pairs=tuple(pairs_from(query_bytes, blob))))
 
-    def _prepare(self, _: bytes, *, region: str, learned: str | None) -> Answer:
+    def _prepare(self, _: bytes, *, region: str, learned: str | None, is_kept: bool = False) -> Answer:
         reading, looking, matcher = _Cost(), _Cost(), self.plugin
         place = read_region(Path(region), around=lambda: reading, around_layer=lambda: looking, with_layers=False)
         self._grid = place.grid
+
+        def keep(what: str, settings: Mapping[str, Any]) -> Path | None:
+            """Ask for what is kept of the map; its time is none of the matcher's."""
+            with looking:
+                said = self._wants({"what": what, "settings": settings, "digest": place.manifest.digest})
+            folder = Path(str(said["folder"])) if said["folder"] else None
+            return folder if folder is not None and folder.is_dir() else None  # gone meanwhile, or not shown
+
+        if is_kept:
+            vars(place)["keep"] = keep
         with (preparing := _Cost()):
             matcher.prepare(place, learned)
         # The region keeps what it read for good; a layer that was read alone is the matcher's, if it is kept.
@@ -130,7 +139,9 @@ class Maps(Mapping[str, Region]):
 
 def _resident_bytes() -> int:
     try:
-        number = int(os.readlink("/proc/self"))  # noqa: PTH115 - no file, a number
-    except OSError:
-        number = os.getpid()
-    return int(psutil.Process(number).memory_info().rss)
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except OSError:  # no Linux
+        import psutil  # noqa: PLC0415 - takes longer to import than a town to prepare
+
+        return int(psutil.Process().memory_info().rss)
+    return pages * os.sysconf("SC_PAGE_SIZE")

@@ -42,6 +42,7 @@ class PluginServer(ABC, Generic[Plugin]):
         self.spec = spec
         self.luggage = luggage.decode()
         self._made: Plugin | None = None
+        self._nonce: wire.Json = None  # of the question that is answered
 
     def run(self) -> None:
         """Serve until the other side closes."""
@@ -59,13 +60,19 @@ class PluginServer(ABC, Generic[Plugin]):
 
     def _answered(self, message: wire.Message, blob: bytes) -> bytes:
         """Return the answer to a question as it is sent."""
-        head = {"nonce": message["nonce"]}
+        self._nonce = message["nonce"]
+        head = {"nonce": self._nonce}
         fields = {name: value for name, value in message.items() if name not in {"kind", "nonce"}}
         try:
             content, data = getattr(self, f"_{message['kind']}")(blob, **fields)
             return wire.packed({**head, "status": "ok", **content}, data)
         except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
             return wire.packed({**head, **_failure(error, plugin=self._made)})
+
+    def _wants(self, wanted: wire.Message) -> wire.Message:
+        """Ask the runner for something, before the question is answered; return what it says."""
+        wire.send(self.channel, {"nonce": self._nonce, "wanted": wanted})
+        return wire.receive(self.channel)[0]
 
     @abstractmethod
     def _make(self) -> Plugin:

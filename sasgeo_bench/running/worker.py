@@ -46,6 +46,7 @@ from sasgeo_bench.matching.matcher import (
 from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.failures import LOG, is_disk_error, our_failure
+from sasgeo_bench.running.kept import kept_of, shelf_of
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import LEAN, WATCH_S, Group, MemoryWatch
@@ -151,6 +152,21 @@ def checked(kind: TypeAdapter[Checked], given: object) -> Checked:
         raise MatchError(one_line(f"{where}: {fault}" if where else fault)) from error
 
 
+class _Wanted(StrictModel):
+    what: Literal["field", "chart", "graph"]
+    settings: dict[str, JsonValue]
+    digest: str
+
+
+class _Wants(StrictModel):
+    """A question of a process, before it answers one itself."""
+
+    nonce: str
+    wanted: _Wanted
+
+
+_WANTED: Final = TypeAdapter(_Wants)
+_MOST_WANTED: Final = 8  # by one question
 _FAILED: Final = TypeAdapter(_Failed)
 _SOUND: Final = TypeAdapter(_Sound)
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
@@ -268,7 +284,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         """Import the plugin."""
         return self._ask("load", timeout_s=self.limits.prepare_s)
 
-    def _learn(self, blob: bytes = b"", **asked_for: wire.Json) -> PluginReply[AnyCard, Found]:
+    def _learn(self, blob: bytes = b"", **asked_for: Any) -> PluginReply[AnyCard, Found]:  # noqa: ANN401 - of JSON
         most_bytes = self.most_learned_bytes + wire.MOST_BYTES
         return self._ask("learn", blob, timeout_s=self.limits.learn_s, most_bytes=most_bytes, **asked_for)
 
@@ -282,9 +298,13 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         *,
         timeout_s: float,
         most_bytes: int = wire.MOST_BYTES,
+        give: Callable[[Message, str, float], Message] | None = None,
         **asked_for: wire.Json,
     ) -> PluginReply[AnyCard, Found]:
-        """Ask a question of a kind, with its fields and the bytes after it; the methods of a server answer it."""
+        """Ask a question of a kind, with its fields and the bytes after it; the methods of a server answer it.
+
+        What the process wants to know before it answers, `give` returns, given its question, the nonce and a deadline.
+        """
         nonce = secrets.token_hex(16)  # so that no answer can be made in advance
         try:
             channel = self._started()
@@ -292,6 +312,11 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
             deadline = time.monotonic() + timeout_s
             wire.send(channel, {"kind": kind, **asked_for, "nonce": nonce}, blob, deadline=deadline)
             answer, data = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
+            for _ in range(_MOST_WANTED):
+                if give is None or "wanted" not in answer:
+                    break
+                wire.send(channel, give(answer, nonce, deadline), deadline=deadline)
+                answer, data = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
             came = time.perf_counter()
             reply = self._read(kind, answer, data, nonce=nonce)
         except wire.WireTimeout as late:
@@ -445,18 +470,28 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
 
     _region: Path | None = None
     _learned: str | None = None
+    _seen: int = -1  # which of its processes was asked a query, or taught, last
 
     def learn(self, regions: Mapping[str, Path], pairs: Iterable[tuple[bytes, Truth]]) -> Reply:
         """Train on queries, each a row in Arrow's stream format, and their truths, with maps by name."""
         sizes, blob = pairs_bytes(pairs)
         maps = {name: str(path.resolve()) for name, path in regions.items()}
-        return self._learn(blob, regions=maps, query_bytes=sizes)
+        reply = self._learn(blob, regions=maps, query_bytes=sizes)
+        self._seen = self.starts
+        return reply
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, given the learned text."""
         self._region, self._learned = region, learned
-        place = str(region.resolve())
-        reply = self._ask("prepare", timeout_s=self.limits.prepare_s, region=place, learned=learned)
+        place, is_kept = str(region.resolve()), shelf_of(region) is not None
+        reply = self._ask(
+            "prepare",
+            timeout_s=self.limits.prepare_s,
+            give=self._given,
+            region=place,
+            learned=learned,
+            is_kept=is_kept,
+        )
         if reply.status != "ok":
             self.end()
         return reply
@@ -475,10 +510,28 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
             again = self.prepare(self._region, self._learned)
             if again.status != "ok":
                 return again
+        self._seen = self.starts
         reply = self._ask("match", query, timeout_s=self.limits.match_s, top_k=top_k)
         if reply.status in {"timeout", "crash"} and self._is_gone():
             self.end()
         return reply
+
+    def _given(self, asked: Message, nonce: str, deadline: float) -> Message:
+        """Return the folder of what is kept of the map that is prepared."""
+        wants = checked(_WANTED, asked)
+        if self._region is None or wants.nonce != nonce:
+            raise MatchError("question does not belong to this map")
+        if self._seen == self.starts:  # settings could tell its next process what it saw
+            return {"folder": None}
+        timeout_s = max(deadline - time.monotonic(), 0.0) / 2  # the matcher may have to make it itself
+        wanted = wants.wanted
+        folder = kept_of(self._region, wanted.what, wanted.settings, digest=wanted.digest, timeout_s=timeout_s)
+        return {"folder": None if folder is None else str(folder)}
+
+    def _policy(self, scratch: str) -> sandbox.Policy:
+        """Let it read what is kept of its maps, too."""
+        policy, shelves = super()._policy(scratch), filter(None, map(shelf_of, self.reach.readable))
+        return replace(policy, readable=[*policy.readable, *map(str, shelves)])
 
     def _found(self, data: bytes) -> Prediction:
         return check_prediction(checked(ROW, data), None, top_k=MOST_CANDIDATES)

@@ -10,13 +10,13 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import cv2
+import lazy_loader  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
-import pandas as pd
+import scipy  # its clusters are loaded where they are used
 from numpy.typing import NDArray
-from scipy.cluster import vq
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -25,6 +25,11 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import SEASONS, information
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:  # loaded where a table is made
+    pd = lazy_loader.load("pandas")
 
 CELL_M: Final = 4.0  # of a configuration: each sector of a ring holds some cells
 RINGS_M: Final = (16.0, 48.0)  # a junction; a junction and the next houses
@@ -82,7 +87,7 @@ class Rarity:
         starts = starts[np.sort(rng.permutation(len(starts))[:64])]  # kinds of configurations
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty cluster keeps its centre
-            words = vq.kmeans2(few, starts, iter=_ROUNDS, minit="matrix")[0].astype(np.float32)
+            words = scipy.cluster.vq.kmeans2(few, starts, iter=_ROUNDS, minit="matrix")[0].astype(np.float32)
         word = _nearest(standard, words)
         share = np.bincount(word, minlength=len(words)) / len(word)
         weight = -np.log(share + 1e-3)  # epsilon of Eq. 6
@@ -196,7 +201,7 @@ def class_weights_of(model: ScorerModel, *, age_years: float, season: str = "") 
 
 def class_weight_table(
     model: ScorerModel, *, ages_years: Sequence[float] = AGES_YEARS, season: str = ""
-) -> pd.DataFrame:
+) -> "pd.DataFrame":
     """Return weights, gains and information of each class as the map ages, a row for each class and age.
 
     Columns: class, age_years; weight (see `class_weights_of`); agree, extra, missed, quiet (see `Gains`) and
@@ -247,7 +252,7 @@ def weight_map(
     return total
 
 
-def side_by_side(tables: Mapping[str, pd.DataFrame], column: str) -> pd.DataFrame:
+def side_by_side(tables: "Mapping[str, pd.DataFrame]", column: str) -> "pd.DataFrame":
     """Join one column of several tables: a row for each class, a column for each table and age."""
     wide = {
         name: table.pivot_table(index="class", columns="age_years", values=column, sort=False)

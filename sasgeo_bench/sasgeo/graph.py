@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Final, Self
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy  # its optimizers are loaded where they are used: matchers without a graph start without them
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, inverse, wrap_deg
@@ -338,7 +338,7 @@ class _Judge:
         table = np.zeros((len(stage.places_m), len(stage.around)))
         table[pairs.seen, pairs.mapped] = np.maximum(gain, 0.0)
         rows, cols = np.unique(pairs.seen), np.unique(pairs.mapped)
-        row, col = linear_sum_assignment(table[np.ix_(rows, cols)], maximize=True)
+        row, col = scipy.optimize.linear_sum_assignment(table[np.ix_(rows, cols)], maximize=True)
         chosen = np.zeros_like(table, dtype=bool)
         chosen[rows[row], cols[col]] = True
         return pairs.some(chosen[pairs.seen, pairs.mapped] & (gain > 0))

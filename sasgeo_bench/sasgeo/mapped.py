@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Graph of a map, prepared for queries around a pose, with an index of pairs of junctions."""
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
-from typing import Final, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Self
 
-import geopandas as gpd
 import numpy as np
+import scipy  # its trees are loaded where they are used: matchers without a graph start without them
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from sasgeo_bench.core.arrays import map_arrays, save_arrays
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.regions.graph import LAYERS, build_graph
@@ -26,6 +29,10 @@ from sasgeo_bench.sasgeo.nodes import (
     out_of_water,
     patches_of,
 )
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+    from scipy.spatial import cKDTree
 
 Bits = NDArray[np.uint64]
 
@@ -57,7 +64,7 @@ class JunctionPairs:
         places_m = nodes.places_m[chosen]
         pairs = np.zeros((0, 2), dtype=np.int64)
         if len(chosen):
-            pairs = cKDTree(places_m).query_pairs(range_m[1], output_type="ndarray").astype(np.int64)
+            pairs = scipy.spatial.cKDTree(places_m).query_pairs(range_m[1], output_type="ndarray").astype(np.int64)
         along_m = places_m[pairs[:, 1]] - places_m[pairs[:, 0]]
         length_m = np.hypot(*along_m.T)
         order = np.lexsort((pairs[:, 1], pairs[:, 0], length_m))
@@ -95,6 +102,7 @@ class JunctionPairs:
         return np.asarray(first + np.flatnonzero(fits.all(axis=1)))
 
 
+_FIELDS: Final = tuple(item.name for item in fields(Nodes))
 CROWD_M: Final = 150.0  # around a node, where its like are counted
 _APART_M: Final = 1e4  # much more than any gate
 
@@ -112,7 +120,7 @@ class MappedGraph:
     """
 
     nodes: Nodes
-    tree: cKDTree
+    tree: "cKDTree"
     density_per_m2: Floats
     known: Bools
     grid: Grid
@@ -120,23 +128,43 @@ class MappedGraph:
     @classmethod
     def of(cls, region: Region) -> Self:
         """Prepare the graph of a region."""
+        kept = region.kept("graph")
+        with suppress(StoreError):  # removed meanwhile: it is made
+            if kept is not None:
+                return cls.open(kept, grid=region.grid)
         return cls.make(region.graph, region.features, known=region.known(), grid=region.grid)
 
     @classmethod
-    def make(cls, graph: MapGraph, features: gpd.GeoDataFrame, *, known: Bools, grid: Grid) -> Self:
+    def make(cls, graph: MapGraph, features: "gpd.GeoDataFrame", *, known: Bools, grid: Grid) -> Self:
         """Prepare a graph that was derived from features."""
         ways = features[features["class"].isin(list(LAYERS)).to_numpy()]
         plan = in_plan(ways)
         in_masks = out_of_water(nodes_of(build_graph(plan, bounds_m=grid.bounds_m), plan, "mask"), features)
         nodes = Nodes.joined((nodes_of(graph, ways, "vectors"), in_masks, patches_of(features)))
+        return cls._of(nodes, known=known, grid=grid)
+
+    @classmethod
+    def open(cls, folder: Path, *, grid: Grid) -> Self:
+        """Open what `save` wrote; raise `StoreError` if it is missing or damaged."""
+        found = map_arrays(folder, "known", *_FIELDS)
+        known = found.pop("known")
+        # In memory, where they are looked up one by one
+        return cls._of(Nodes(**{name: values.copy() for name, values in found.items()}), known=known, grid=grid)
+
+    def save(self, folder: Path) -> None:
+        """Write it to a folder."""
+        save_arrays(folder, asdict(self.nodes) | {"known": self.known})
+
+    @classmethod
+    def _of(cls, nodes: Nodes, *, known: Bools, grid: Grid) -> Self:
         found = np.zeros(len(NODE_KINDS))
         for kind in np.unique(nodes.kind):
             places_m = nodes.places_m[nodes.kind == kind]
-            counts = cKDTree(places_m).query_ball_point(places_m, CROWD_M, return_length=True)
+            counts = scipy.spatial.cKDTree(places_m).query_ball_point(places_m, CROWD_M, return_length=True)
             found[kind] = np.mean(counts) / (np.pi * CROWD_M**2)
         return cls(
             nodes=nodes,
-            tree=cKDTree(_raised(nodes.places_m, nodes.kind)),
+            tree=scipy.spatial.cKDTree(_raised(nodes.places_m, nodes.kind)),
             density_per_m2=found,
             known=known,
             grid=grid,
@@ -148,9 +176,9 @@ class MappedGraph:
         return self.nodes.links()
 
     @cached_property
-    def plan(self) -> cKDTree:
+    def plan(self) -> "cKDTree":
         """Return a tree of the places."""
-        return cKDTree(self.nodes.places_m)
+        return scipy.spatial.cKDTree(self.nodes.places_m)
 
     @cached_property
     def junction_pairs(self) -> dict[int, tuple[JunctionPairs, JunctionPairs]]:

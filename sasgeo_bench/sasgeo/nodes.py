@@ -3,20 +3,22 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, Self
+from typing import TYPE_CHECKING, Final, Literal, Self
 
-import geopandas as gpd
+import lazy_loader  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
+import scipy  # its trees are loaded where they are used: a map that was prepared before needs none
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
 from sasgeo_bench.regions.graph import LAYERS, RELATIONS, ROAD, VERTEX_M, find_crossings, make_chains, make_network
-from sasgeo_bench.regions.layers import centroids, groups_within
 from sasgeo_bench.regions.region import MapGraph
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+else:  # loaded when a table of geometry is made
+    gpd = lazy_loader.load("geopandas")
 
 Drawing = Literal["vectors", "mask"]
 
@@ -163,7 +165,7 @@ def nothing() -> Nodes:
     )
 
 
-def in_plan(ways: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+def in_plan(ways: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Return ways as a mask shows them: the visible ones, with a vertex wherever roads cross.
 
     A mask does not tell a bridge over a road from a junction, so both must give the same nodes, arms and connections.
@@ -204,7 +206,7 @@ def in_plan(ways: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     return ways.set_geometry(gpd.GeoSeries(shapes, index=ways.index, crs=ways.crs))
 
 
-def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> Nodes:
+def nodes_of(graph: MapGraph, features: "gpd.GeoDataFrame", drawing: Drawing) -> Nodes:
     """Return the nodes of a graph as vectors or as a mask show them.
 
     The arms of junctions come from `features`, of which the graph was made. For a mask both are of ways `in_plan`;
@@ -241,9 +243,13 @@ BLUR_M: Final = 8.0  # junctions nearer than this are one in a mask: a road's wi
 
 def _blurred(nodes: Nodes) -> Nodes:
     """Merge nodes of one kind within a road's width."""
-    near = cKDTree(nodes.places_m).query_pairs(BLUR_M, output_type="ndarray") if len(nodes) else nodes.pairs
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - as scipy above
+
+    near = (
+        scipy.spatial.cKDTree(nodes.places_m).query_pairs(BLUR_M, output_type="ndarray") if len(nodes) else nodes.pairs
+    )
     near = near[nodes.kind[near[:, 0]] == nodes.kind[near[:, 1]]]
-    links = coo_array((np.ones(len(near)), near.T), shape=(len(nodes), len(nodes)))
+    links = scipy.sparse.coo_array((np.ones(len(near)), near.T), shape=(len(nodes), len(nodes)))
     group = nodes.kind
     if len(nodes):
         group = np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
@@ -295,7 +301,7 @@ def _by_row(row: Ints, bearing: Floats, count: int) -> Floats:
 ARM_M: Final = 12.0  # along a road to where its direction is measured: past the curbs of a junction
 
 
-def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
+def arms_of(features: "gpd.GeoDataFrame", places_m: Floats) -> Floats:
     """Return bearings of the roads that leave places where a road begins, ends or forks.
 
     Parameters
@@ -342,7 +348,7 @@ def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
 TOUCH_M: Final = 0.5  # outlines nearer than this are one patch in a mask
 
 
-def patches_of(features: gpd.GeoDataFrame) -> Nodes:
+def patches_of(features: "gpd.GeoDataFrame") -> Nodes:
     """Return buildings and areas as a mask shows them: touching areas of one class merge.
 
     Examples
@@ -352,6 +358,8 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
     >>> patches_of(as_features(vector_table(row))).area_m2.tolist()
     [162.0, 81.0]
     """
+    from sasgeo_bench.regions.layers import centroids, groups_within  # noqa: PLC0415 - imports GDAL
+
     names, seen = features["class"].to_numpy(dtype=object), features["is_visible"].to_numpy(dtype=bool)
     all_shapes = np.asarray(features.geometry.array)
     is_area = seen & (shapely.get_dimensions(all_shapes) == 2) & (shapely.area(all_shapes) > 0)
@@ -388,7 +396,7 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
     return Nodes.joined([nothing(), *parts])
 
 
-def out_of_water(nodes: Nodes, features: gpd.GeoDataFrame) -> Nodes:
+def out_of_water(nodes: Nodes, features: "gpd.GeoDataFrame") -> Nodes:
     """Return the nodes of a mask without those of rivers where visible water covers them: no line is drawn there.
 
     Examples

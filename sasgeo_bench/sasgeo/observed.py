@@ -3,21 +3,18 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import cv2
-import geopandas as gpd
 import numpy as np
+import scipy
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from skimage.morphology import skeletonize
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, cell_offsets_m
 from sasgeo_bench.regions.graph import LAYERS, ROAD, build_graph, make_network
-from sasgeo_bench.regions.layers import delaunay_pairs
 from sasgeo_bench.sasgeo.nodes import (
     INDEX,
     NODE_KINDS,
@@ -35,12 +32,15 @@ from sasgeo_bench.sasgeo.nodes import (
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.vectors import as_features, instances_of_mask, vector_table
 
+if TYPE_CHECKING:
+    import geopandas as gpd
+
 # Classes thinned together, and the class of their lines: crossings do not depend on the class of a road.
 SKELETON_LAYERS: Final = {"road_minor": ROADS} | {name: (name,) for name in LAYERS if name not in ROADS}
 _FORK: Final = 3
 
 
-def lines_of_mask(evidence: Evidence) -> gpd.GeoDataFrame:
+def lines_of_mask(evidence: Evidence) -> "gpd.GeoDataFrame":
     """Return the centre lines of `SKELETON_LAYERS` in a view, as `Query.vectors`."""
     rows = []
     for name, classes in SKELETON_LAYERS.items():
@@ -55,6 +55,8 @@ _ROUGH_CELLS: Final = 0.75  # tolerance of the simplification of stairs
 
 def middle_lines(present: NDArray[np.bool_], cell_size_m: float) -> NDArray[np.object_]:
     """Return the centre lines of a mask in (right, up) from its middle, metres; they end at forks."""
+    from skimage.morphology import skeletonize  # noqa: PLC0415 - as in `load_libraries`
+
     closed = cv2.morphologyEx(present.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), dtype=np.uint8))
     thin = np.asarray(skeletonize(closed > 0), dtype=np.bool_)
     places_m = cell_offsets_m((present.shape[0], present.shape[1]), cell_size_m)
@@ -131,7 +133,7 @@ class ObservedGraph:
         return cls.make(query.evidence, query.vectors)
 
     @classmethod
-    def make(cls, evidence: Evidence, vectors: gpd.GeoDataFrame | None = None) -> Self:
+    def make(cls, evidence: Evidence, vectors: "gpd.GeoDataFrame | None" = None) -> Self:
         """Derive the graph of a view.
 
         Each family (roads, railways, waterways, buildings) comes from the vectors if they hold any of it, else from the
@@ -146,6 +148,8 @@ class ObservedGraph:
         >>> [(NODE_KINDS[kind].name, place.round().tolist()) for kind, place in zip(nodes.kind, nodes.places_m)]
         [('mask intersection', [14.0, 0.0])]
         """
+        from sasgeo_bench.regions.layers import delaunay_pairs  # noqa: PLC0415 - imports GDAL
+
         names = set() if vectors is None else set(vectors["class"])
         drawn = {name for family in _FAMILIES if names & set(family) for name in family}
         parts = [nothing()]
@@ -179,7 +183,7 @@ class ObservedGraph:
         return self.nodes.links()
 
 
-def _from_vectors(vectors: gpd.GeoDataFrame, evidence: Evidence) -> Nodes:
+def _from_vectors(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Nodes:
     features = as_features(bridged(vectors))
     nodes = nodes_of(build_graph(features), features, "vectors")
     # A building that the view cuts differs from the map in centre and area.
@@ -209,7 +213,7 @@ def _from_mask(evidence: Evidence, *, without: set[str]) -> Nodes:
 BRIDGED_M: Final = 7.0  # facing ends of roads within this distance are one road: as far as a street is wide
 
 
-def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+def bridged(vectors: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Return vectors with facing ends of roads within 7 m joined: a road that a detector broke is one road."""
     features = as_features(vectors)
     network = make_network(features[features["class"].isin(list(LAYERS)).to_numpy()])
@@ -218,7 +222,7 @@ def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     arm_deg = arms_of(features, places_m)[:, 0]
     if len(free) < 2:  # a join has two ends
         return vectors
-    pairs = cKDTree(places_m).query_pairs(BRIDGED_M, output_type="ndarray")
+    pairs = scipy.spatial.cKDTree(places_m).query_pairs(BRIDGED_M, output_type="ndarray")
     ahead_deg = bearing_deg(*(places_m[pairs[:, 1]] - places_m[pairs[:, 0]]).T)
     off_deg = np.abs(
         np.stack((wrap_deg(arm_deg[pairs[:, 0]] + 180 - ahead_deg), wrap_deg(arm_deg[pairs[:, 1]] - ahead_deg)))

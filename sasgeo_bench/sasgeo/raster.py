@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -12,21 +13,20 @@ from typing import TYPE_CHECKING, Final, Self
 
 import cv2
 import numpy as np
-import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import FEATURES, LAYERS, read_manifest, read_region
 from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
 from sasgeo_bench.sasgeo.weights import STRATA, Gains, strata, weigh
-from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
-from sasgeo_bench.search.stored import StoredField, store_levels
+from sasgeo_bench.search.field import FULL, Cells, Field, Template, between, squares
+from sasgeo_bench.search.stored import FACTORS, StoredField, store_levels
 from sasgeo_bench.tasks.vectors import as_features
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ BRIDGE: Final = "bridge"
 LEVEL_M: Final = 24.0  # standard deviation of the ground that a class is compared with; from train places
 REPEATED: Final = 3e3  # nats2 m2 of a class that say half of what as many independent cells would; from train places
 _LEAST: Final = 1e-6
-_FIELD_VERSION: Final = 1  # raised whenever the same map and settings give other levels
+_FIELD_VERSION: Final = 2  # raised whenever the same map and settings give other levels
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
 
 
@@ -73,13 +73,18 @@ def read_field(
     `likeness`, shape (C, FAR + 1), is that of `rates.likeness` or `likeness_by_hand`; `trust`, shape (C, STRATA), that
     of `weights.fit_trust`, 1 without it. Cells have a whole number of map cells a side, of about `cell_size_m`.
     """
+    by_stratum = None if trust is None else trust.tolist()
+    kept = region.kept("field", likeness=likeness.tolist(), trust=by_stratum, cell_size_m=cell_size_m)
+    with suppress(StoreError):  # removed meanwhile: it is made
+        if kept is not None:
+            return StoredField.open(kept).field()
     factor = max(1, round(cell_size_m / region.grid.cell_size_m))
     grid = region.grid.coarsen(factor)
     around = ((0, -region.grid.rows % factor), (0, -region.grid.cols % factor))
     known = _share(region.known(), around, grid) > FULL // 2
     stamped = None if trust is None else strata(region)
-    cells = np.zeros((*grid.shape, len(region.classes) + 1), dtype=np.uint8)
-    cells[known, -1] = FULL
+    cells = Cells.zeros(len(region.classes) + 1, grid.shape)
+    cells.band(len(region.classes))[known] = FULL
     for at, name in enumerate(region.classes):
         if trust is None or stamped is None:
             shares, weights = [_share(region.layer(name) == PRESENT, around, grid)], np.ones(1)
@@ -87,7 +92,7 @@ def read_field(
             shares, weights = [_share(stamped[at] == index, around, grid) for index in range(STRATA)], trust[at]
         degree = _degree(shares, weights, likeness[at], grid)
         degree[~known] = 0
-        cells[..., at] = degree
+        cells.band(at)[:] = degree
     return Field(grid=grid, cells=cells)
 
 
@@ -98,12 +103,13 @@ def store_field(
     *,
     trust: NDArray[np.float64] | None = None,
     cell_size_m: float = CELL_M,
+    factors: tuple[int, ...] = FACTORS,
 ) -> StoredField:
     """Store what `read_field` makes of a region, in levels on disk: window by window, so that it may be a country.
 
     `region` is the folder of the region, `into` that of the levels; levels that are there of the same map, settings and
-    format are opened. The other arguments are those of `read_field`. Raise `StoreError` if the region is damaged or the
-    folder cannot be written.
+    format are opened. `factors` are as of `store_levels`, the other arguments those of `read_field`. Raise `StoreError`
+    if the region is damaged or the folder cannot be written.
     """
     manifest = read_manifest(region)
     factor = max(1, round(cell_size_m / manifest.cell_size_m))
@@ -125,9 +131,9 @@ def store_field(
             round(shift_m / grid.cell_size_m)
             for shift_m in (field.grid.north_m - window.north_m, window.west_m - field.grid.west_m)
         )
-        return Field(grid=window, cells=field.cells[row : row + window.rows, col : col + window.cols])
+        return Field(grid=window, cells=field.cells.cut(row, col, window.shape))
 
-    return store_levels(into, grid, len(manifest.classes), paint, key=key)
+    return store_levels(into, grid, len(manifest.classes), paint, key=key, factors=factors)
 
 
 def _degree(
@@ -187,6 +193,10 @@ def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
     >>> burnt(house, Evidence(classes=("building",), cells=cells, cell_size_m=1.0)).cells.tolist()
     [[[1, 1, 0, 2], [1, 1, 0, 2]]]
     """
+    import pandas as pd  # noqa: PLC0415 - views without vectors need no tables, and no GDAL
+
+    from sasgeo_bench.regions.layers import burn_layers, make_paint  # noqa: PLC0415
+
     features = as_features(vectors)
     is_line = features["width_m"].notna().to_numpy()
     seen = {*vectors["class"], *((BRIDGE,) if is_line.any() else ())}
@@ -263,12 +273,12 @@ def explained(evidence: Evidence, classes: Sequence[str], field: Field, poses: S
     Examples
     --------
     >>> grid = Grid(epsg=0, west_m=-4.0, north_m=4.0, cell_size_m=2.0, rows=4, cols=4)
-    >>> cells = np.full((4, 4, 2), FULL, dtype=np.uint8)
-    >>> cells[:, 2:, 0] = 0  # water in the west
+    >>> water, known = np.full((1, 4, 4), FULL, dtype=np.uint8), np.full((4, 4), FULL, dtype=np.uint8)
+    >>> water[:, :, 2:] = 0  # in the west
     >>> seen = np.tile([0.3, 0.3, 0.1, 0.1], (1, 4, 1))
     >>> view = Evidence.of_probabilities(("water",), seen, cell_size_m=2.0)
     >>> north, south = (Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg) for yaw_deg in (0.0, 180.0))
-    >>> explained(view, ("water",), Field(grid=grid, cells=cells), [north, south]).round(2).tolist()
+    >>> explained(view, ("water",), Field.of(grid=grid, layers=water, known=known), [north, south]).round(2).tolist()
     [[0.51], [0.0]]
     """
     pool = max(1, round(field.grid.cell_size_m / evidence.cell_size_m))
@@ -282,9 +292,9 @@ def explained(evidence: Evidence, classes: Sequence[str], field: Field, poses: S
     seen = seen / np.maximum(known, _LEAST)
     found = np.zeros((len(poses), len(classes)))
     for row, pose in zip(found, poses, strict=True):
-        under = warped(field.cells, between(frame, pose, field.grid), frame.shape)
-        for number, one, weights in zip(at, seen, known * under[..., -1] / FULL, strict=True):
-            row[number] = _explained(one, under[..., number] / FULL, weights)
+        under = field.cells.under(between(frame, pose, field.grid), frame.shape)
+        for number, one, weights in zip(at, seen, known * under.band(len(classes)) / FULL, strict=True):
+            row[number] = _explained(one, under.band(number) / FULL, weights)
     return found
 
 
@@ -334,10 +344,10 @@ class RasterView:
         weights, known = summed[: len(active)], summed[len(active) :]
         total = np.zeros((len(poses), len(self.weights)))
         for row, pose in zip(total, poses, strict=True):
-            under = warped(field.cells, between(frame, pose, field.grid), frame.shape)
-            row[active] = np.einsum("cij,ij->c", known, under[..., -1].astype(np.float32))
+            under = field.cells.under(between(frame, pose, field.grid), frame.shape)
+            row[active] = np.einsum("cij,ij->c", known, under.band(len(self.weights)).astype(np.float32))
             for at, layer in zip(active.tolist(), weights, strict=True):
-                row[at] += np.vdot(layer, under[..., at].astype(np.float32))
+                row[at] += np.vdot(layer, under.band(at).astype(np.float32))
         return total / FULL
 
     def levelled(self) -> Self:

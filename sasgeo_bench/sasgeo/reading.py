@@ -5,11 +5,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
+import scipy  # its trees are loaded where they are used: matchers without a graph start without them
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
@@ -28,6 +28,9 @@ from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.tasks.query import Query
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 APART_M: Final = (30.0, 180.0)  # of two junctions: nearer ones give no heading, farther ones are seldom both in a view
 SLACK_M: Final = 4.0  # tolerance of their distance
@@ -118,7 +121,7 @@ def _similarities(
 def _counted(cast: Floats, count: int) -> list[Proposal]:
     """Return poses with the most votes, best first, no two for one place and heading."""
     at = _spread(cast)
-    tree = cKDTree(at)
+    tree = scipy.spatial.cKDTree(at)
     # 10 cells of votes tried for each requested pose
     found = [_gathered(cast, at, tree, start) for start in _crowded(cast, at, 10 * count)]
     kept: list[tuple[Proposal, Floats]] = []
@@ -149,7 +152,7 @@ def _crowded(cast: Floats, at: Floats, most: int) -> Floats:
     return np.asarray(middle[np.argsort(-weight, kind="stable")[:most]])
 
 
-def _gathered(cast: Floats, at: Floats, tree: cKDTree, start: Floats) -> tuple[Proposal, Floats]:
+def _gathered(cast: Floats, at: Floats, tree: "cKDTree", start: Floats) -> tuple[Proposal, Floats]:
     """Return the pose of the votes around a point, and its point; each pair of the view votes once."""
     place = at[tree.query(start)[1]]
     for _ in range(2):

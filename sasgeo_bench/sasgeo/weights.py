@@ -8,17 +8,21 @@ ratios, which tend to 0 as a class loses its information.
 import datetime as dt
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Final, Self, get_args
+from typing import TYPE_CHECKING, Final, Self, get_args
 
+import lazy_loader  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from sasgeo_bench.osm.taxonomy import Season, load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, LEVELS, PRESENT, SILENT
-from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.rates import ClassRates, Tally
+
+if TYPE_CHECKING:
+    import pandas as pd
+else:  # loaded where ages of features are read
+    pd = lazy_loader.load("pandas")
 
 _LEAST: Final = 1e-4  # least distance of probabilities from 0 and 1
 
@@ -200,7 +204,7 @@ class StampTally:
     far_missed: NDArray[np.int64]
 
 
-def idle_years(edited: pd.Series, date: dt.date) -> NDArray[np.float64]:
+def idle_years(edited: "pd.Series", date: dt.date) -> NDArray[np.float64]:
     """Return years from the last edit of each feature to the date of a map, shape (N,); 0 without a timestamp."""
     edited = pd.to_datetime(edited, utc=True).dt.tz_localize(None)
     days = (pd.Timestamp(date) - edited).dt.days.to_numpy(dtype=np.float64)
@@ -212,6 +216,8 @@ def strata(region: Region) -> NDArray[np.uint8]:
 
     i below `IDLE_YEARS[i]`, the last above all, `NEVER` where the class is not.
     """
+    from sasgeo_bench.regions.layers import burn_layers, make_paint  # noqa: PLC0415 - imports GDAL
+
     idle = idle_years(region.features["timestamp"], region.manifest.extract.date)
     stratum = np.searchsorted(IDLE_YEARS, idle, side="right")
     made = np.where(region.layers == PRESENT, np.uint8(STRATA - 1), np.uint8(NEVER))

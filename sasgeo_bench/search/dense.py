@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, normalize_deg
-from sasgeo_bench.search.field import FULL, Field, Level, Levels, Template, between, pooled, warped
+from sasgeo_bench.search.field import FOUR, FULL, Cells, Field, Level, Levels, Template, between, fours_of, pooled
 from sasgeo_bench.search.plan import Disc, Mode, Null, Tile, Turns, in_threads, tiles_of
 from sasgeo_bench.search.shifts import Correlation
 
@@ -277,18 +277,19 @@ class _Peaks:
 
 
 LEAST_SCALE: Final = 0.05
+_AT_ONCE: Final = 40_000  # cells of all fours that are scored together: more leave the cache, and take twice the time
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevelView:
     """A view in cells about as large as those of a level, and the level, to be scored pose by pose.
 
-    `bands`, shape (rows, cols, K + 1) as the cells of the level, are sums over squares of the view, `frame` is
-    their lattice.
+    `parts` are cells of the level and sums over squares of the view, shape (G, rows, 1, 1, 4 * cols), by fours alike;
+    `frame` is the lattice of the squares.
     """
 
     level: Level
-    bands: NDArray[np.float32]
+    parts: tuple[tuple[Cells, NDArray[np.float32]], ...]
     frame: Grid
 
     @classmethod
@@ -297,18 +298,30 @@ class LevelView:
         level = field.level(factor)
         pool = max(1, round(level.grid.cell_size_m / template.cell_size_m))
         summed, frame = pooled(template, level, pool)
-        bands = np.zeros((*frame.shape, level.cells.shape[-1]), dtype=np.float32)
-        bands[..., template.active] = np.moveaxis(summed, 0, -1)
-        return cls(level=level, bands=bands, frame=frame)
+        bands = np.zeros((fours_of(level.cells.count), *frame.shape, FOUR), dtype=np.float32)
+        for at, band in zip(template.active.tolist(), summed, strict=True):
+            bands[at // FOUR, :, :, at % FOUR] = band
+        by_row, cells = bands.reshape(len(bands), frame.rows, 1, 1, -1), level.cells
+        at_once = max(1, _AT_ONCE // (frame.rows * frame.cols))
+        parts = (slice(first, first + at_once) for first in range(0, len(bands), at_once))
+        pairs = tuple((replace(cells, fours=cells.fours[part]), by_row[part]) for part in parts)
+        return cls(level=level, parts=pairs, frame=frame)
 
     def scores(self, pose: Pose, *, reach: int = 1) -> NDArray[np.float64]:
         """Return scores of a pose and its shifts by cells; [i, j] is that of `shifted(pose, i - reach, j - reach)`."""
-        rows, cols = self.frame.shape
-        wide = self.frame.window(-reach, -reach, rows + 2 * reach, cols + 2 * reach)
-        under = warped(self.level.cells, between(wide, pose, self.level.grid), wide.shape).astype(np.float32)
-        shifts = range(2 * reach + 1)
-        windows = ((under[row : row + rows, col : col + cols] for col in shifts) for row in shifts)
-        return np.array([[np.einsum("ijb,ijb", cut, self.bands) for cut in row] for row in windows]) / FULL
+        (rows, cols), side = self.frame.shape, 2 * reach + 1
+        to_level = between(self.frame, pose, self.level.grid)
+        to_level[:, 2] -= reach * to_level[:, :2].sum(axis=1)
+        found = np.zeros((side, side))
+        for cells, bands in self.parts:
+            under = cells.under(to_level, (rows + 2 * reach, cols + 2 * reach)).fours.astype(np.float32)
+            of_four, of_row, of_cell, of_band = under.strides
+            # Each row of the view over the map at each shift, summed in one call; shifts last: a row stays in the
+            # cache. A bare array, since numpy's `as_strided` takes as long as the sums of a small view.
+            shape, strides = (len(under), rows, side, side, FOUR * cols), (of_four, of_row, of_row, of_cell, of_band)
+            shifted = np.ndarray(shape, np.float32, under, 0, strides)
+            found += np.vecdot(shifted, bands).sum(axis=(0, 1), dtype=np.float64)
+        return found / FULL
 
     def score(self, pose: Pose) -> float:
         """Return the score of a pose."""

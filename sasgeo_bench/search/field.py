@@ -2,7 +2,8 @@
 """Map fields and view templates: the linear form of Eqs. 7-8 of the SASGeo paper, in cells of any size."""
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import Final, Protocol, Self, TypeVar
 
@@ -20,18 +21,69 @@ _AXES: Final = 3
 _NOTHING: Final = 1e-9
 Value = TypeVar("Value", np.float32, np.uint8)
 
+FOUR: Final = 4  # bands that lie together: OpenCV resamples four at once in a tenth of the time that five take
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cells:
+    """Bands of a raster, by fours.
+
+    `fours` is uint8 of shape (G, rows, cols, 4): band b is `fours[b // 4, :, :, b % 4]`, and those from `count` on are
+    0. Bands of a cell lie together, since a search reads them together.
+
+    Examples
+    --------
+    >>> cells = Cells.zeros(5, (2, 3))
+    >>> cells.band(4)[1, 2] = 7
+    >>> cells.fours.shape, cells.fours[1, 1, 2].tolist(), cells.cut(1, 2, (1, 1)).band(4).tolist()
+    ((2, 2, 3, 4), [7, 0, 0, 0], [[7]])
+    """
+
+    fours: NDArray[np.uint8]
+    count: int
+
+    @classmethod
+    def zeros(cls, count: int, shape: tuple[int, int]) -> Self:
+        """Return bands of zeros, to be filled."""
+        return cls(fours=np.zeros((fours_of(count), *shape, FOUR), dtype=np.uint8), count=count)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return rows and columns."""
+        return self.fours.shape[1], self.fours.shape[2]
+
+    def band(self, at: int) -> NDArray[np.uint8]:
+        """Return a band, shape (rows, cols): a view."""
+        return self.fours[at // FOUR, :, :, at % FOUR]
+
+    def cut(self, row: int, col: int, shape: tuple[int, int]) -> Self:
+        """Return a window: a view."""
+        return replace(self, fours=self.fours[:, row : row + shape[0], col : col + shape[1]])
+
+    def under(self, to_cells: NDArray[np.float64], shape: tuple[int, int]) -> Self:
+        """Resample all bands linearly, 0 beyond the raster; `to_cells` from `between`."""
+        fours = np.empty((len(self.fours), *shape, FOUR), dtype=np.uint8)
+        for into, four in zip(fours, self.fours, strict=True):
+            warped(four, to_cells, shape, into=into)
+        return replace(self, fours=fours)
+
+
+def fours_of(count: int) -> int:
+    """Return in how many fours so many bands lie."""
+    return -(-count // FOUR)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
     """A field in cells of `factor` of its own, with thin classes spread by one cell.
 
-    `cells` is uint8 of shape (rows, cols, K + 1), the last band known cells: bands of a cell lie together, since they
-    are read together. `thinner`, shape (K + 1,), is the area of each class over its spread area, 1 without spreading.
+    `cells` has K + 1 bands, the last one known cells. `thinner`, shape (K + 1,), is the area of each class over its
+    spread area, 1 without spreading.
     """
 
     factor: int
     grid: Grid
-    cells: NDArray[np.uint8]
+    cells: Cells
     thinner: NDArray[np.float64]
 
     def window(self, row: int, col: int, shape: tuple[int, int], bands: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -40,8 +92,9 @@ class Level:
         top, left = max(row, 0), max(col, 0)
         bottom, right = min(row + shape[0], self.grid.rows), min(col + shape[1], self.grid.cols)
         if top < bottom and left < right:
-            under = np.moveaxis(self.cells[top:bottom, left:right], -1, 0)
-            cut[:, top - row : bottom - row, left - col : right - col] = under[bands]
+            inside = np.s_[top - row : bottom - row, left - col : right - col]
+            for into, at in zip(cut, bands.tolist(), strict=True):
+                into[inside] = self.cells.band(at)[top:bottom, left:right]
         cut /= FULL
         return cut
 
@@ -63,9 +116,8 @@ class Levels(Protocol):
 class Field:
     """Layers of a map for the bands of a template.
 
-    `cells`, uint8 of shape (rows, cols, K + 1), are the degrees to which the map holds each class, 0..FULL; 0 where it
-    is unknown. The last band is FULL where the map is known, else 0. Beyond the grid it is unknown. Bands of a cell lie
-    together, since a search reads them together.
+    `cells` are the degrees to which the map holds each of K classes, 0..FULL; 0 where it is unknown. The last band,
+    K, is FULL where the map is known, else 0. Beyond the grid it is unknown.
 
     Raises
     ------
@@ -74,16 +126,15 @@ class Field:
     """
 
     grid: Grid
-    cells: NDArray[np.uint8]
+    cells: Cells
     _levels: dict[int, Level] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check shape and type; lock the cells."""
-        if self.cells.ndim != _AXES or self.cells.shape[:2] != self.grid.shape:
-            raise ShapeError(f"a field has cells (rows, cols, K + 1), {self.grid.shape}, got {self.cells.shape}")
-        if self.cells.dtype != np.uint8:
-            raise ShapeError(f"a field holds uint8, got {self.cells.dtype}")
-        self.cells.flags.writeable = False
+        fours, shape = self.cells.fours, (fours_of(self.cells.count), *self.grid.shape, FOUR)
+        if fours.shape != shape or fours.dtype != np.uint8:
+            raise ShapeError(f"a field has cells of {shape} in uint8, got {fours.shape} in {fours.dtype}")
+        fours.flags.writeable = False
 
     @classmethod
     def of(cls, *, grid: Grid, layers: NDArray[np.uint8], known: NDArray[np.uint8]) -> Self:
@@ -91,17 +142,27 @@ class Field:
         shapes = (layers.shape, known.shape)
         if layers.ndim != _AXES or not layers.shape[1:] == known.shape == grid.shape:
             raise ShapeError(f"a field has layers (K, rows, cols) and known (rows, cols), {grid.shape}, got {shapes}")
-        return cls(grid=grid, cells=np.stack((*layers, known), axis=-1))
+        if not layers.dtype == known.dtype == np.uint8:
+            raise ShapeError(f"a field holds uint8, got {layers.dtype} and {known.dtype}")
+        cells = Cells.zeros(len(layers) + 1, grid.shape)
+        for at, band in enumerate((*layers, known)):
+            cells.band(at)[:] = band
+        return cls(grid=grid, cells=cells)
 
     @property
     def layers(self) -> NDArray[np.uint8]:
-        """Return the degrees to which the map holds each class, shape (K, rows, cols): a view of the cells."""
-        return np.moveaxis(self.cells[..., :-1], -1, 0)
+        """Return the degrees to which the map holds each class, shape (K, rows, cols): a copy."""
+        bands = [self.cells.band(at) for at in range(self.cells.count - 1)]
+        return np.stack(bands) if bands else np.zeros((0, *self.grid.shape), dtype=np.uint8)
 
     @property
     def known(self) -> NDArray[np.uint8]:
         """Return FULL where the map is known, else 0, shape (rows, cols): a view of the cells."""
-        return self.cells[..., -1]
+        return self.cells.band(self.cells.count - 1)
+
+    def add_levels(self, made: Iterable[Level]) -> None:
+        """Take levels that were made of it before, as `level` makes them."""
+        self._levels.update({level.factor: level for level in made})
 
     def level(self, factor: int) -> Level:
         """Return the map in cells of `factor` of its own a side; each level is made once."""
@@ -159,32 +220,60 @@ class Template:
 
 def _level(field: Field, factor: int) -> Level:
     """Spread each thin class by a large cell, then average."""
-    grid = field.grid.coarsen(factor)
+    grid, own = field.grid.coarsen(factor), field.cells
     if factor == 1:
-        return Level(factor=1, grid=grid, cells=field.cells, thinner=np.ones(field.cells.shape[-1]))
-    kernel = round_kernel(factor)
-    size, around = (grid.cols, grid.rows), ((0, -field.grid.rows % factor), (0, -field.grid.cols % factor))
-    cells, thinner = np.empty((*grid.shape, field.cells.shape[-1]), dtype=np.uint8), np.ones(field.cells.shape[-1])
-    for at in range(len(thinner)):
-        band = np.ascontiguousarray(field.cells[..., at])
-        if at < len(thinner) - 1:  # the last one says where the map is known
-            band, thinner[at] = _spread(band, kernel)
-        cells[..., at] = cv2.resize(np.pad(band, around), size, interpolation=cv2.INTER_AREA)
+        return Level(factor=1, grid=grid, cells=own, thinner=np.ones(own.count))
+    kernel, cells = round_kernel(factor), Cells.zeros(own.count, grid.shape)
+    grown = [dilated(four, kernel) for four in own.fours]
+    before, after = (np.concatenate([cv2.sumElems(four) for four in fours]) for fours in (own.fours, grown))
+    thinner = thinner_of(before[: own.count], after[: own.count])
+    thin = np.resize(thinner < 1, len(grown) * FOUR).reshape(-1, FOUR)  # spare bands are zeros either way
+    for into, four, spread, chosen in zip(cells.fours, own.fours, grown, thin, strict=True):
+        into[:] = averaged(np.where(chosen, spread, four), factor)
     return Level(factor=factor, grid=grid, cells=cells, thinner=thinner)
 
 
-def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
-    """Return a spread class, and its former share of that area."""
+def averaged(four: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Return means of squares of cells, those at the edge with zeros beyond it."""
+    rows, cols = (-(-side // factor) for side in four.shape[:2])
+    padded = np.pad(four, ((0, -four.shape[0] % factor), (0, -four.shape[1] % factor), (0, 0)))
+    return np.asarray(cv2.resize(padded, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def thinner_of(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the `Level.thinner` of bands from their sums as they are and spread; the last one, known cells, is 1."""
     # A coarse pose may be off by a cell, which misses lines and houses but hardly woods and fields. Spread woods would
     # outscore the right place, so a class that grows little stays unchanged.
-    grown = np.asarray(cv2.dilate(band, kernel), dtype=np.uint8)
-    share = float(band.sum(dtype=np.float64) / max(grown.sum(dtype=np.float64), 1.0))
-    return (grown, share) if is_thin(np.float64(share)) else (band, 1.0)
+    share = before / np.maximum(after, 1.0)
+    share[-1] = 1.0
+    return np.where(share < 0.5, share, 1.0)  # 0.5: share of its spread area below which a class counts as thin
 
 
-def is_thin(share: NDArray[np.float64] | np.float64) -> NDArray[np.bool_]:
-    """Return whether a class that has such a share of its spread area is spread on a level."""
-    return np.asarray(share < 0.5)  # share of its spread area below which a class counts as thin
+_MANY: Final = 8  # cells of a radius from which a kernel costs less row by row
+
+
+def dilated(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the largest value under a `round_kernel` around each cell of a band, or of four, as `cv2.dilate` does.
+
+    A large kernel costs less row by row: its rows are runs, and a wider run is a run of the next narrower one.
+
+    Examples
+    --------
+    >>> dot = np.zeros((41, 41), dtype=np.uint8)
+    >>> dot[20, 20] = 1
+    >>> np.array_equal(dilated(dot, round_kernel(16))[4:37, 4:37], round_kernel(16))
+    True
+    """
+    reach, rows = len(kernel) // 2, len(band)
+    if reach < _MANY:
+        return np.asarray(cv2.dilate(band, kernel), dtype=np.uint8)
+    run, width, grown = np.pad(band, ((reach, reach), *[(0, 0)] * (band.ndim - 1))), 1, np.zeros_like(band)
+    for down, wider in enumerate(kernel[: reach + 1].sum(axis=1, dtype=int).tolist(), start=-reach):
+        if wider > width:
+            run, width = np.asarray(cv2.dilate(run, np.ones((1, wider - width + 1), dtype=np.uint8))), wider
+        for shift in {down, -down} if wider else ():
+            cv2.max(grown, run[reach + shift : reach + shift + rows], dst=grown)
+    return grown
 
 
 def round_kernel(radius: float) -> NDArray[np.uint8]:
@@ -202,7 +291,7 @@ def _softened(template: Template, level: Level) -> NDArray[np.float32]:
     kernel = round_kernel(level.grid.cell_size_m / template.cell_size_m)
     for band, at in zip(bands, template.active.tolist(), strict=True):
         if level.thinner[at] < 1:
-            near = cv2.dilate((band > 0).astype(np.uint8), kernel) > 0
+            near = dilated((band > 0).astype(np.uint8), kernel) > 0
             band[band < 0] *= level.thinner[at]
             band[(band < 0) & near] = 0
     return bands
@@ -252,13 +341,27 @@ def _summed(parts: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def between(frame: Grid, pose: Pose, grid: Grid) -> NDArray[np.float64]:
     """Return the affine map, shape (2, 3), from columns and rows of a view to those of a map; centres are whole."""
-    corners = frame.to_en_m(np.array([(0.5, 0.5), (1.5, 0.5), (0.5, 1.5)]))
-    start, across, down = grid.to_uv(pose.to_map(corners))
-    return np.column_stack((across - start, down - start, start - 0.5))
+    # In plain numbers: a search asks for it at every pose that it tries
+    yaw, cell_m = math.radians(pose.yaw_deg), grid.cell_size_m
+    cosine, sine = pose.scale * math.cos(yaw), pose.scale * math.sin(yaw)
+    right_m, up_m = frame.west_m + frame.cell_size_m / 2, frame.north_m - frame.cell_size_m / 2  # of the first cell
+    col = (pose.easting_m + cosine * right_m + sine * up_m - grid.west_m) / cell_m - 0.5
+    row = (grid.north_m - pose.northing_m + sine * right_m - cosine * up_m) / cell_m - 0.5
+    step = frame.cell_size_m / cell_m
+    return np.array([[step * cosine, -step * sine, col], [step * sine, step * cosine, row]])
 
 
-def warped(layer: NDArray[Value], to_layer: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[Value]:
-    """Resample a raster, (rows, cols) or (rows, cols, bands), linearly, 0 beyond it; `to_layer` from `between`."""
+def warped(
+    layer: NDArray[Value],
+    to_layer: NDArray[np.float64],
+    shape: tuple[int, int],
+    *,
+    into: NDArray[Value] | None = None,
+) -> NDArray[Value]:
+    """Resample a raster, (rows, cols) or (rows, cols, bands), linearly, 0 beyond it; `to_layer` from `between`.
+
+    `into`, of the shape and type of the result, is written to.
+    """
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     if max(layer.shape[:2]) > 32_766:  # 32_766 cells: OpenCV warps no larger raster
         # Part of a raster that lies under a view, and the affine map to it
@@ -268,4 +371,4 @@ def warped(layer: NDArray[Value], to_layer: NDArray[np.float64], shape: tuple[in
         last = np.clip(np.ceil(far.max(axis=0)).astype(np.int64) + 2, first + 1, most)
         moved = to_layer - np.column_stack((np.zeros((2, 2)), first))
         layer, to_layer = layer[first[1] : last[1], first[0] : last[0]], moved
-    return np.asarray(cv2.warpAffine(layer, to_layer, shape[::-1], flags=flags), dtype=layer.dtype)
+    return np.asarray(cv2.warpAffine(layer, to_layer, shape[::-1], dst=into, flags=flags), dtype=layer.dtype)

@@ -19,7 +19,7 @@ from sasgeo_bench.core.json import read_json
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.search.field import Field, Level, is_thin, round_kernel
+from sasgeo_bench.search.field import FOUR, Cells, Field, Level, averaged, dilated, fours_of, round_kernel, thinner_of
 
 FACTORS: Final = (1, 2, 4, 8, 16, 32)  # cells of 2 m: views of up to 2 km
 WINDOW_CELLS: Final = 2048  # of the map's own cells: 14 bands of one window take 60 MB
@@ -57,13 +57,20 @@ class StoredField:
             found._cells(factor)
         return found
 
-    def _cells(self, factor: int) -> NDArray[np.uint8]:
+    def _cells(self, factor: int) -> Cells:
         """Map the cells of a level into memory; raise `StoreError` if they are not what the grid says."""
         path = self.folder / _name(factor)
         try:
-            return _mapped(path, (*self.grid.coarsen(factor).shape, len(self.thinner[factor])))
+            count = len(self.thinner[factor])
+            return Cells(fours=_mapped(path, _shape_of(self.grid.coarsen(factor).shape, count)), count=count)
         except Exception as error:  # NumPy parses a header as Python, which fails at damage with errors of many kinds
             raise _damaged(self.folder, error) from error
+
+    def field(self) -> Field:
+        """Return it as a field: the levels that are stored are mapped, others are made when they are asked for."""
+        found = Field(grid=self.grid, cells=self.level(1).cells)
+        found.add_levels(map(self.level, self.thinner))
+        return found
 
     def level(self, factor: int) -> Level:
         """Return the map in cells of `factor` of its own a side; raise `StoreError` if that level is not stored."""
@@ -145,7 +152,7 @@ def store_levels(
     >>> town = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (1, 64, 64), p=[0.9, 0.1])
     >>> whole = Field.of(grid=grid, layers=town, known=np.full((64, 64), 255, np.uint8))
     >>> stored = store_levels(Path(mkdtemp()) / "town", grid, 1, lambda _: whole, factors=(1, 2, 4))
-    >>> all(np.array_equal(stored.level(at).cells, whole.level(at).cells) for at in (1, 2, 4))
+    >>> all(np.array_equal(stored.level(at).cells.fours, whole.level(at).cells.fours) for at in (1, 2, 4))
     True
     """
     window_cells = window_cells or WINDOW_CELLS
@@ -155,8 +162,8 @@ def store_levels(
             f"windows of {window_cells} cells cut cells of the levels {uneven}: name a multiple of all factors"
         )
     with locked(folder):
-        if (folder / _ABOUT).is_file() and (found := StoredField.open(folder)).key == key:
-            return found
+        if (folder / _ABOUT).is_file() and _key_of(folder) == key:
+            return StoredField.open(folder)
         if folder.exists() and not folder.is_dir():
             raise StoreError(f"{folder} is no folder: name another one")
         names = {_ABOUT, *map(_name, FACTORS), *map(_name, factors)} if is_ours(folder / _ABOUT) else set[str]()
@@ -167,7 +174,7 @@ def store_levels(
                 for row, col, window in grid.windows(window_cells):
                     field = paint(window)
                     if field is not None:
-                        base[row : row + window.rows, col : col + window.cols] = field.cells
+                        base.cut(row, col, window.shape).fours[:] = field.cells.fours
                 shares = {1: np.ones(bands + 1)}
                 for factor in factors:
                     if factor > 1:
@@ -188,58 +195,54 @@ def store_levels(
     return StoredField.open(folder)
 
 
+def _key_of(folder: Path) -> str | None:
+    """Return of what the levels in a folder are made, whatever layout they have."""
+    about = read_json(folder / _ABOUT, mend=_MEND)
+    return str(about.get("key")) if isinstance(about, dict) else None
+
+
 def _name(factor: int) -> str:
     return f"level-{factor}.npy"
 
 
-def _made(folder: Path, name: str, shape: tuple[int, int], bands: int) -> NDArray[np.uint8]:
-    return open_memmap(folder / name, mode="w+", dtype=np.uint8, shape=(*shape, bands))
+def _shape_of(shape: tuple[int, int], count: int) -> tuple[int, int, int, int]:
+    return (fours_of(count), *shape, FOUR)
 
 
-def _store_level(
-    folder: Path, base: NDArray[np.uint8], grid: Grid, factor: int, window_cells: int
-) -> NDArray[np.float64]:
+def _made(folder: Path, name: str, shape: tuple[int, int], count: int) -> Cells:
+    fours = open_memmap(folder / name, mode="w+", dtype=np.uint8, shape=_shape_of(shape, count))
+    return Cells(fours=fours, count=count)
+
+
+def _store_level(folder: Path, base: Cells, grid: Grid, factor: int, window_cells: int) -> NDArray[np.float64]:
     """Store a level, as `Field.level` makes it, and return its `thinner`."""
     # Whether a class is thin is known when all of the map was looked at: until then there are two versions, the class
     # as it is and spread.
-    shape, bands = grid.coarsen(factor).shape, base.shape[-1]
+    shape, bands = grid.coarsen(factor).shape, base.count
     plain, grown = (_made(folder, name, shape, bands) for name in (_name(factor), "grown.npy"))
-    before, after = np.zeros(bands), np.zeros(bands)
+    before, after = np.zeros((len(base.fours), FOUR)), np.zeros((len(base.fours), FOUR))
     kernel = round_kernel(factor)
     for row, col, window in grid.windows(window_cells):
         top, left = max(row - factor, 0), max(col - factor, 0)
-        around = base[top : row + window.rows + factor, left : col + window.cols + factor]
-        if not around.any():
-            continue
+        around = base.cut(top, left, (row + window.rows + factor - top, col + window.cols + factor - left))
         inner = np.s_[row - top : row - top + window.rows, col - left : col - left + window.cols]
         coarse = np.s_[
             row // factor : -(-(row + window.rows) // factor), col // factor : -(-(col + window.cols) // factor)
         ]
-        for band in range(bands):
-            layer = np.ascontiguousarray(around[..., band])
-            if not layer.any():
+        for at, four in enumerate(around.fours):
+            if not four.any():
                 continue
-            own = layer[inner]
-            plain[(*coarse, band)] = _averaged(own, factor)
-            if band < bands - 1:  # the last one says where the map is known
-                spread = np.asarray(cv2.dilate(layer, kernel), dtype=np.uint8)[inner]
-                grown[(*coarse, band)] = _averaged(spread, factor)
-                before[band] += own.sum(dtype=np.float64)
-                after[band] += spread.sum(dtype=np.float64)
-    shares = before / np.maximum(after, 1.0)
-    shares[-1] = 1.0
-    thin = is_thin(shares)
-    for rows in _stripes(shape[0]):
-        plain[rows][..., thin] = grown[rows][..., thin]
+            own, spread = four[inner], dilated(four, kernel)[inner]
+            plain.fours[at][coarse], grown.fours[at][coarse] = averaged(own, factor), averaged(spread, factor)
+            before[at] += cv2.sumElems(own)
+            after[at] += cv2.sumElems(spread)
+    thinner = thinner_of(before.ravel()[:bands], after.ravel()[:bands])
+    for at in np.flatnonzero(thinner < 1).tolist():
+        for rows in _stripes(shape[0]):
+            plain.band(at)[rows] = grown.band(at)[rows]
     del grown
     (folder / "grown.npy").unlink()
-    return np.where(thin, shares, 1.0)
-
-
-def _averaged(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    rows, cols = (-(-side // factor) for side in layer.shape)
-    padded = np.pad(layer, ((0, -layer.shape[0] % factor), (0, -layer.shape[1] % factor)))
-    return np.asarray(cv2.resize(padded, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return thinner
 
 
 def _stripes(rows: int) -> Iterator[slice]:

@@ -647,9 +647,9 @@ class BatchSearch:
             raise ShapeError(f"each view has a prior, got {len(templates)} templates and {len(priors)} priors")
         groups: dict[tuple[object, ...], list[int]] = {}
         for at, template in enumerate(templates):
-            if len(template.bands) != self.field.cells.shape[-1]:
+            if len(template.bands) != self.field.cells.count:
                 raise ShapeError(
-                    f"templates[{at}] has {len(template.weights)} classes, the map {len(self.field.layers)}"
+                    f"templates[{at}] has {len(template.weights)} classes, the map {self.field.cells.count - 1}"
                 )
             if len(template.active):
                 patches = self._search(template, priors[at]).patches
@@ -736,10 +736,9 @@ class BatchSearch:
     def _cells(self, views: Views, factor: int) -> Tensor:
         """Return the bands of a level that views need, 0..1, shape (B, rows, cols)."""
         if factor not in self._levels:
-            cells = torch.from_numpy(self.field.level(factor).cells).to(self.device)
-            self._levels[factor] = (
-                cells.permute(2, 0, 1).to(torch.float32, memory_format=torch.contiguous_format) / FULL
-            )
+            cells = self.field.level(factor).cells
+            fours = torch.from_numpy(cells.fours).to(self.device).permute(0, 3, 1, 2).flatten(0, 1)
+            self._levels[factor] = fours[: cells.count].to(torch.float32) / FULL
         cells = self._levels[factor]
         return cells if len(cells) == len(views.active) else cells[views.active]
 

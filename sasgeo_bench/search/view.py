@@ -2,13 +2,18 @@
 """Templates of a view: turned onto the map lattice, sampled, and scored at single poses."""
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Final, Self, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.core.arrays import map_arrays, save_arrays
+from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
@@ -34,22 +39,48 @@ class Chart:
     @classmethod
     def of(cls, region: Region, *, thin: tuple[str, ...] = (), reach_m: float = 0.0) -> Self:
         """Read a region; the classes in `thin` fade with the distance to the nearest cell, as in `fade`."""
+        kept = region.kept("chart", thin=list(thin), reach_m=reach_m)
+        with suppress(StoreError):  # removed meanwhile: it is made
+            if kept is not None:
+                return cls.open(kept, region)
         known = region.known()
         degree = np.empty((len(region.classes), *region.grid.shape), dtype=np.uint8)
-        for name, kept in zip(region.classes, degree, strict=True):
+        for name, layer in zip(region.classes, degree, strict=True):
             present = (region.layer(name) == PRESENT) & known
             if name in thin and reach_m > 0:
                 faded = np.rint(FULL * fade(present, reach_cells=reach_m / region.grid.cell_size_m))
-                kept[:] = np.where(present, FULL, np.minimum(faded, FULL - 1)) * known
+                layer[:] = np.where(present, FULL, np.minimum(faded, FULL - 1)) * known
             else:
-                np.multiply(present, np.uint8(FULL), out=kept)
+                np.multiply(present, np.uint8(FULL), out=layer)
         return cls(
             grid=region.grid, classes=region.classes, degree=degree, known=np.where(known, np.uint8(FULL), np.uint8(0))
         )
 
+    @classmethod
+    def open(cls, folder: Path, region: Region) -> Self:
+        """Map what `save` wrote of a region into memory; raise `StoreError` if it is missing or damaged."""
+        found = map_arrays(folder, "degree", "known", "totals")
+        chart = cls(grid=region.grid, classes=region.classes, degree=found["degree"], known=found["known"])
+        vars(chart)["totals"] = found["totals"]  # to sum them again would read all of the map
+        return chart
+
+    def save(self, folder: Path) -> None:
+        """Write it to a folder."""
+        save_arrays(folder, {"degree": self.degree, "known": self.known, "totals": self.totals})
+
+    @cached_property
+    def totals(self) -> NDArray[np.int64]:
+        """Return the sum of the cells of each class and, last, that of the known ones, shape (C + 1,)."""
+        return np.array([layer.sum(dtype=np.int64) for layer in (*self.degree, self.known)], dtype=np.int64)
+
     def used(self) -> NDArray[np.bool_]:
         """Return which classes the map holds, shape (C,)."""
-        return np.asarray(self.degree.reshape(len(self.degree), -1).max(axis=1) > 0)
+        return np.asarray(self.totals[:-1] > 0)
+
+    def shares(self) -> NDArray[np.float64]:
+        """Return the mean degree of each class over the known cells, 0..1, shape (C,); 0 where none is known."""
+        known = max(int(self.totals[-1]) // FULL, 1)
+        return np.asarray(self.totals[:-1] / known / FULL)
 
     def square(self, row: int, col: int, size: int, bands: NDArray[np.int64]) -> NDArray[np.float32]:
         """Read a square of classes and, last, known cells, 0..1, shape (bands + 1, size, size); 0 beyond the map.

@@ -451,3 +451,40 @@ class WantsImages(Plain):
 
 class WantsImagery(Plain):
     card = MatcherCard(name="wants-imagery", tracks=("localization", "retrieval"), needs=("imagery",), **SAID)
+
+
+class ReadsWhatIsKept(Plain):
+    """Asks for what is kept of the map; tries to change it, to see that of other maps, and to have nonsense made."""
+
+    def prepare(self, region, learned):
+        super().prepare(region, learned)
+        folder = region.kept("chart", thin=[], reach_m=0.0)
+        try:
+            others = [path for path in folder.parent.parent.iterdir() if path != folder.parent]
+        except OSError:
+            others = []
+        written = []
+        for path in (folder / "known.npy", folder / "more.npy", folder.parent / "more"):
+            try:
+                path.write_bytes(b"mine")
+                written.append(path.name)
+            except OSError:
+                pass
+        nonsense = {"chart": {"thin": [], "reach_m": 1e9}, "field": {"into": "/tmp"}}  # noqa: S108 - a name
+        self.told = {
+            "is there": float((folder / "known.npy").is_file()),
+            "other maps": float(len(others)),
+            "written": float(len(written)),
+            "nonsense": float(sum(region.kept(what, **settings) is not None for what, settings in nonsense.items())),
+        }
+
+    def match(self, query, *, top_k):
+        found = super().match(query, top_k=top_k)
+        return Match(poses=found.poses, scores=found.scores, diagnostics=self.told)
+
+
+class AsksForWhatIsNotKept(Plain):
+    """Asks the runner for what it does not have, in the middle of an answer."""
+
+    def prepare(self, region, learned):
+        region.kept("truth")

@@ -29,7 +29,7 @@ from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import STRATA, even_gains, likelihood_gains
 from sasgeo_bench.search import stored
-from sasgeo_bench.search.field import FULL
+from sasgeo_bench.search.field import FULL, Field
 from sasgeo_bench.search.find import score_at, search
 from sasgeo_bench.tasks.vectors import vector_table
 
@@ -222,7 +222,7 @@ def test_a_map_on_disk_is_the_one_read_into_memory(tiny, tmp_path, monkeypatch, 
     assert found.grid == whole.grid
     assert found.grid.rows > 2 * 192
     for factor in (1, 16):
-        np.testing.assert_array_equal(found.level(factor).cells, whole.level(factor).cells)
+        np.testing.assert_array_equal(found.level(factor).cells.fours, whole.level(factor).cells.fours)
     again = store_field(tiny.folder / "regions" / tiny.region.manifest.id, tmp_path / "map", near, trust=trust)
     assert again == found
 
@@ -261,9 +261,9 @@ def test_more_that_is_mapped_and_not_seen_explains_less(tiny, field, widest):
     query, pose = widest
     view = faint(query, tiny.region, pose)
     clearest = explained(view, tiny.region.classes, field, [pose])[0].argmax()
-    crowded = field.cells.copy()
-    crowded[::3, :, clearest] = FULL
-    fields = (field, replace(field, cells=crowded))
+    crowded = field.layers
+    crowded[clearest, ::3] = FULL
+    fields = (field, Field.of(grid=field.grid, layers=crowded, known=field.known))
     before, after = (explained(view, tiny.region.classes, each, [pose])[0, clearest] for each in fields)
     assert after < 0.7 * before
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import map_coordinates
 
 from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
-from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
-from sasgeo_bench.search.dense import _Peaks
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, cell_offsets_m, observe
+from sasgeo_bench.search.dense import LevelView, _Peaks
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
 from sasgeo_bench.search.find import Search, exhaustive, rank, score_at, search
 from sasgeo_bench.search.plan import Mode, Plan, all_around, posterior, thinned
@@ -256,7 +257,7 @@ def test_only_what_is_thin_is_spread_on_large_cells():
     layers = np.zeros((2, 64, 64), dtype=np.uint8)
     layers[0, 32] = layers[1, :, 16:56] = 1
     level = as_field(a_grid(64), layers).level(8)
-    road, wood, _ = np.moveaxis(level.cells, -1, 0) / FULL
+    road, wood = (level.cells.band(at) / FULL for at in (0, 1))
     assert np.flatnonzero(road[:, 0]).tolist() == [3, 4, 5]
     assert np.flatnonzero(wood[0]).tolist() == [2, 3, 4, 5, 6]
     assert level.thinner.tolist() == pytest.approx([1 / 17, 1.0, 1.0])
@@ -336,3 +337,27 @@ def test_squares_of_a_view_sum_to_the_last_bit_as_numpy_does(pool):
     assert found.dtype == np.float32
     assert np.array_equal(found, parts.sum(axis=(2, 4)))
     assert found.shape[1:] == frame.shape
+
+
+def test_scores_around_a_pose_are_sums_over_the_interpolated_map():
+    rng = np.random.default_rng(5)
+    layers = np.stack([place_of(60, seed=seed)[seed % 3] for seed in range(6)])  # seven bands: two fours
+    field = as_field(a_grid(60), layers)
+    view = Template(
+        weights=rng.normal(size=(6, 12, 9)).astype(np.float32),
+        known=rng.normal(size=(12, 9)).astype(np.float32),
+        cell_size_m=1.0,
+    )
+    pose = Pose(easting_m=1028.3, northing_m=1969.6, yaw_deg=33.0, scale=1.1)
+    of_level = LevelView.of(field, view, 1)
+    table = of_level.scores(pose)
+    assert table.std() > 3
+    for down, right in np.ndindex(3, 3):
+        moved = of_level.shifted(pose, down - 1, right - 1)
+        points_m = moved.to_map(cell_offsets_m((12, 9), 1.0).reshape(-1, 2))
+        cols, rows = field.grid.to_uv(points_m).T - 0.5
+        bands = [*(layers == PRESENT).astype(float), np.ones((60, 60))]
+        under = np.stack([map_coordinates(band, [rows, cols], order=1).reshape(12, 9) for band in bands])
+        by_hand = float((under * view.bands).sum())
+        assert table[down, right] == pytest.approx(by_hand, abs=0.5)  # OpenCV interpolates between 32 steps
+        assert of_level.score(moved) == pytest.approx(table[down, right], abs=1e-3)

@@ -61,10 +61,10 @@ def stored(tmp_path_factory, whole):
 @pytest.mark.parametrize("factor", FACTORS)
 def test_a_level_on_disk_is_the_one_made_in_memory(stored, whole, factor):
     found, expected = stored.level(factor), whole.level(factor)
-    np.testing.assert_array_equal(found.cells, expected.cells)
+    np.testing.assert_array_equal(found.cells.fours, expected.cells.fours)
     np.testing.assert_array_equal(found.thinner, expected.thinner)
     assert (found.grid, found.factor) == (expected.grid, expected.factor)
-    assert isinstance(found.cells.base, np.memmap)
+    assert isinstance(found.cells.fours.base, np.memmap)
     assert factor < 8 or (found.thinner[0] < 0.5 and found.thinner[[1, 3]].tolist() == [1.0, 1.0])  # thin and wide
 
 
@@ -134,7 +134,7 @@ def test_what_is_cut_off_leaves_the_levels_as_they_were(tmp_path, whole):
         ("levels.json", lambda data: data.replace(b"1.0]", b'"nan"]'), "are no shares"),
         ("levels.json", lambda data: re.sub(rb'"thinner": {.*?}', b'"thinner": {}', data), "lists no level 1"),
         ("levels.json", lambda data: data.replace(b'"rows": 150', b'"rows": 151'),
-         r"level-1.npy has uint8 of shape \(150, 203, 4\), expected uint8 of \(151, "),
+         r"level-1.npy has uint8 of shape \(1, 150, 203, 4\), expected uint8 of \(1, 151, "),
         ("level-4.npy", lambda _: b"", "damaged"),
         ("level-4.npy", None, "damaged"),
         ("level-2.npy", lambda _: b"\x93NUMPY\x01\x00v\x00" + b"(" * 118, "TokenError"),

@@ -162,9 +162,7 @@ def test_scores_of_a_level_are_those_of_the_correlation(town):
         wanted, wanted_frame = pooled(template, level, pool)
         np.testing.assert_allclose(bands[0], wanted, rtol=1e-5, atol=1e-5)
         assert frame == wanted_frame
-    cells = torch_search.torch.tensor(level.cells[..., views.active] / FULL, dtype=torch_search.torch.float32).permute(
-        2, 0, 1
-    )
+    cells = torch_search.torch.tensor(np.stack([level.cells.band(at) for at in views.active]).astype(np.float32) / FULL)
     coarse = torch_search.Coarse.of(cells=cells, level=level, views=views, turns=job.turns, most_bytes=2**24)
     lay, board = coarse.lay(job.turns.bases), torch_search.Board.of(coarse, tile)
     scores = board.scores(lay.laid(coarse.bands))[:, 0].transpose(0, 1)[..., : tile.allowed.shape[1]] / board.size

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process that makes what is kept of a map (`running.kept`): code of ours alone, no plugin is imported."""
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.folders import fresh_folder
+from sasgeo_bench.regions.region_files import read_manifest, read_region
+from sasgeo_bench.running.kept import seal
+from sasgeo_bench.sasgeo.mapped import MappedGraph
+from sasgeo_bench.sasgeo.raster import store_field
+from sasgeo_bench.search.view import Chart
+
+_FACTORS: Final = (1, 2, 4, 8, 16)  # views of up to 1 km; the next level takes as long as all of these
+
+
+def _field(
+    region: Path, into: Path, *, likeness: list[list[float]], trust: list[list[float]] | None, cell_size_m: float
+) -> None:
+    by_stratum = None if trust is None else np.array(trust)
+    grades = np.array(likeness)
+    store_field(region, into / "levels", grades, trust=by_stratum, cell_size_m=cell_size_m, factors=_FACTORS)
+    for path in (into / "levels").iterdir():
+        path.rename(into / path.name)
+    (into / "levels").rmdir()
+
+
+def _chart(region: Path, into: Path, *, thin: list[str], reach_m: float) -> None:
+    if not 0 <= reach_m <= 100:  # metres; a table has a row for each cell squared
+        raise ConfigError(f"lines fade within 100 m, not {reach_m!r}")
+    Chart.of(read_region(region, with_layers=False), thin=tuple(thin), reach_m=reach_m).save(into)
+
+
+def _graph(region: Path, into: Path) -> None:
+    MappedGraph.of(read_region(region, with_layers=False)).save(into)
+
+
+MAKERS: Final[Mapping[str, Callable[..., None]]] = {"field": _field, "chart": _chart, "graph": _graph}
+
+
+def make(region: Path, into: Path, what: str, settings: Mapping[str, Any], *, digest: str) -> None:
+    """Make a kind of `MAKERS` of a map by some settings, in a new folder, whole or not at all.
+
+    `digest` is the `Manifest.digest` of the map. Raise `StoreError` if the map is another one, or damaged.
+    """
+    with fresh_folder(into) as scratch:
+        _check(region, digest)
+        MAKERS[what](region, scratch, **settings)
+        _check(region, digest)
+        seal(scratch)
+
+
+def _check(region: Path, digest: str) -> None:
+    if read_manifest(region).digest != digest:
+        raise StoreError(f"{region} was built anew meanwhile")
+
+
+def main() -> None:
+    """Make what standard input orders."""
+    order = json.loads(sys.stdin.read())
+    order |= {name: Path(order[name]) for name in ("region", "into")}
+    make(**order)
+
+
+if __name__ == "__main__":
+    main()

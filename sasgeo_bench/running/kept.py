@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is made of a large map is kept for later processes: by the program alone, in the user's cache, within a size.
+
+A plugin asks for it by name and settings (`Region.kept`); a process of ours without any plugin makes it
+(`running.keeper`), so that no plugin can write what another one reads. A plugin is shown what is kept of its own map.
+"""
+
+import hashlib
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from pydantic import JsonValue
+
+from sasgeo_bench.core.errors import SasgeoError, StoreError
+from sasgeo_bench.core.folders import locked, remove_tree
+from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.texts import one_line
+from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.regions.region_files import read_manifest
+
+VARIABLE: Final = "SASGEO_KEPT_MB"  # most megabytes that are kept; 0 keeps nothing
+MOST_MB: Final = 4000
+LEAST_CELLS: Final = 2048**2  # of a map: a smaller one is made in less time than a process takes to start
+ABOUT: Final = "kept.json"  # written last: sizes of the other files
+_MAKER: Final = "sasgeo_bench.running.keeper"
+
+
+def kept_folder() -> Path:
+    """Return the folder of all that is kept, in the user's cache (`XDG_CACHE_HOME`); it may be removed at any time."""
+    cache_home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache_home, "sasgeo-bench", "maps")
+
+
+def most_bytes() -> int:
+    """Return how many bytes are kept at most, as `SASGEO_KEPT_MB` says."""
+    return _most_mb(os.environ.get(VARIABLE, "")) * 10**6
+
+
+@cache
+def _most_mb(text: str) -> int:
+    if text and not text.isdecimal():
+        tell(f"{VARIABLE} is {text!r}, no whole number of megabytes: {MOST_MB} are kept at most")
+    return int(text) if text.isdecimal() else MOST_MB
+
+
+def shelf_of(region: Path) -> Path | None:
+    """Return the folder of what is kept of a map, made now; None for a small map, or where nothing can be kept."""
+    with suppress(SasgeoError, OSError):
+        manifest = read_manifest(region)
+        if _is_worth_it(manifest):
+            shelf = kept_folder().resolve() / manifest.digest
+            shelf.mkdir(mode=0o700, parents=True, exist_ok=True)  # a map may be private
+            return shelf
+    return None
+
+
+def kept_of(
+    region: Path, what: str, settings: Mapping[str, JsonValue], *, digest: str, timeout_s: float
+) -> Path | None:
+    """Return the folder of what is made of a map by some settings, made now if it is not there; None if that fails.
+
+    Parameters
+    ----------
+    region : Path
+        Folder of the map.
+    what : str
+        A name of `keeper.MAKERS`.
+    settings : mapping
+        Arguments of that maker.
+    digest : str
+        `Manifest.digest` of the map that the asking process has read: of a map that was built anew, nothing is given.
+    timeout_s : float
+        Seconds that it may take.
+    """
+    try:
+        manifest = read_manifest(region)
+        shelf = shelf_of(region)
+        if shelf is None or manifest.digest != digest:
+            return None
+        # Settings, the map, all code of ours, the libraries, the processor: whatever the result may follow from
+        about = [what, dict(settings), digest, _code(), _versions()]
+        folder = shelf / hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+        with locked(folder):
+            if not _is_whole(folder):
+                remove_tree(folder)
+                _make_room(_bytes_of(manifest))
+                places = {"region": str(region), "into": str(folder)}
+                _make({**places, "what": what, "settings": dict(settings), "digest": digest}, timeout_s)
+                if not _is_whole(folder):
+                    return None
+            os.utime(folder / ABOUT)  # what was not asked for longest is removed first
+    except (SasgeoError, OSError, subprocess.SubprocessError, ValueError) as error:
+        tell(f"nothing is kept of {region.name} ({one_line(str(error))[:200]})")
+        return None
+    return folder
+
+
+def seal(folder: Path) -> None:
+    """Record the sizes of the files of what was made, so that it counts as whole."""
+    sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
+    (folder / ABOUT).write_text(json.dumps(sizes), encoding="utf-8")
+
+
+def _is_whole(folder: Path) -> bool:
+    try:
+        sizes = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
+        return bool(sizes) and all((folder / name).stat().st_size == size for name, size in sizes.items())
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def _bytes_of(manifest: Manifest) -> int:
+    """Return about how much is made of a map at most: a byte for each class and cell."""
+    return manifest.rows * manifest.cols * (len(manifest.classes) + 1)
+
+
+def _is_worth_it(manifest: Manifest) -> bool:
+    return manifest.rows * manifest.cols >= LEAST_CELLS and 2 * _bytes_of(manifest) <= most_bytes()
+
+
+def _make(order: Mapping[str, JsonValue], timeout_s: float) -> None:
+    made = subprocess.run(  # noqa: S603 - our own module, by our own interpreter
+        [sys.executable, "-P", "-m", _MAKER],
+        input=json.dumps(order).encode(),
+        capture_output=True,
+        timeout=timeout_s,
+        check=False,
+    )
+    if made.returncode:
+        last = made.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise StoreError(f"it cannot be made: {last}")
+
+
+def _make_room(needed: int) -> None:
+    """Remove what was not asked for longest, until so many bytes fit; raise `StoreError` if the disk lacks them."""
+    root = kept_folder()
+    known: dict[Path, tuple[float, int]] = {}
+    for about in root.glob(f"*/*/{ABOUT}"):
+        with suppress(OSError):
+            size = sum(path.stat().st_size for path in about.parent.iterdir())
+            known[about.parent] = (about.stat().st_mtime, size)
+    total = sum(size for _, size in known.values())
+    for folder in sorted(known, key=lambda folder: known[folder][0]):
+        if total + needed <= most_bytes():
+            break
+        remove_tree(folder)
+        total -= known[folder][1]
+        with suppress(OSError):
+            folder.parent.rmdir()  # of a map of which nothing is kept any more
+    if shutil.disk_usage(root).free < 2 * needed:
+        raise StoreError(f"{root} has too little free space")
+
+
+@cache
+def _code() -> str:
+    """Return the SHA-256 of all files of this package: a change in any makes all anew."""
+    package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
+    for path in sorted((*package.rglob("*.py"), *package.rglob("*.toml"))):
+        data = path.read_bytes()
+        digest.update(f"{path.relative_to(package).as_posix()}\0{len(data)}\0".encode() + data)
+    return digest.hexdigest()
+
+
+@cache
+def _versions() -> list[str]:
+    """Return names and versions of all that is installed, as its folders are called, and of Python and the computer."""
+    installed = {path.name for entry in sys.path if entry for path in Path(entry).glob("*-info")}
+    return [*sorted(installed), platform.python_version(), platform.machine(), platform.node()]

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is kept of a map is what would be made, of this map and these settings; and no plugin can change it."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.regions.region_files import read_manifest, read_region
+from sasgeo_bench.running import keeper, kept, sandbox
+from sasgeo_bench.running.worker import Limits, Reach, Worker
+from sasgeo_bench.sasgeo.mapped import MappedGraph
+from sasgeo_bench.sasgeo.raster import likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.weights import STRATA
+from sasgeo_bench.search.stored import FACTORS
+from sasgeo_bench.search.view import Chart
+from sasgeo_bench.tasks import task_files
+from tests.threaded import Threaded
+
+SETTINGS = {"thin": ["road_major", "railway"], "reach_m": 4.0}
+shut_in = pytest.mark.skipif(sandbox.landlock_version() <= 0, reason="this kernel has no Landlock to refuse files with")
+
+
+@pytest.fixture(autouse=True)
+def shelf(tmp_path, monkeypatch):
+    """A cache of one's own, in which the smallest maps are kept."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("SASGEO_KEPT_MB", "1000")
+    monkeypatch.setattr(kept, "LEAST_CELLS", 1)
+    return tmp_path / "cache" / "sasgeo-bench" / "maps"
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """What is kept is made in this process; the orders in a list."""
+    orders = []
+
+    def make(order, _):
+        orders.append(order)
+        keeper.make(**order | {name: Path(order[name]) for name in ("region", "into")})
+
+    monkeypatch.setattr(kept, "_make", make)
+    return orders
+
+
+def town_of(place, task):
+    return place / "out" / "regions" / task.name
+
+
+def asked(region, what, **settings):
+    return kept.kept_of(region, what, settings, digest=read_manifest(region).digest, timeout_s=600.0)
+
+
+def keeping(region):
+    """The region, as a matcher's process gets it."""
+    found = read_region(region, with_layers=False)
+    vars(found)["keep"] = lambda what, settings: asked(region, what, **settings)
+    return found
+
+
+@pytest.mark.parametrize("is_trusted", [False, True])
+def test_a_kept_field_is_that_which_would_be_made_on_every_level(is_trusted, place, task, here):
+    region = town_of(place, task)
+    likeness = likeness_by_hand(read_manifest(region).classes)
+    trust = np.linspace(1.0, 0.3, len(likeness) * STRATA).reshape(-1, STRATA) if is_trusted else None
+    made, found = (read_field(one, likeness, trust=trust) for one in (read_region(region), keeping(region)))
+    assert len(here) == 1
+    assert found.grid == made.grid
+    for factor in (*FACTORS, 64):
+        one, two = made.level(factor), found.level(factor)
+        np.testing.assert_array_equal(one.cells.fours, two.cells.fours)
+        np.testing.assert_array_equal(one.thinner, two.thinner)
+        assert one.grid == two.grid
+
+
+def test_a_kept_chart_is_that_which_would_be_made(place, task, here):
+    region = town_of(place, task)
+    thin = tuple(SETTINGS["thin"])
+    made, found = (Chart.of(one, thin=thin, reach_m=4.0) for one in (read_region(region), keeping(region)))
+    assert len(here) == 1
+    for name in ("degree", "known", "totals"):
+        np.testing.assert_array_equal(getattr(made, name), getattr(found, name))
+    assert (made.grid, made.classes) == (found.grid, found.classes)
+    is_known = made.known > 0
+    means = [layer[is_known].mean() / 255 if is_known.any() else 0.0 for layer in made.degree]
+    assert found.shares().tolist() == means
+    np.testing.assert_array_equal(found.used(), [layer.max() > 0 for layer in made.degree])
+
+
+def test_a_kept_graph_is_that_which_would_be_made(place, task, here):
+    region = town_of(place, task)
+    made, found = (MappedGraph.of(one) for one in (read_region(region), keeping(region)))
+    assert len(here) == 1
+    for name in kept_fields(made):
+        one, two = getattr(made.nodes, name), getattr(found.nodes, name)
+        np.testing.assert_array_equal(one, two)
+        assert one.dtype == two.dtype
+    np.testing.assert_array_equal(made.density_per_m2, found.density_per_m2)
+    np.testing.assert_array_equal(made.known, found.known)
+    np.testing.assert_array_equal(made.tree.data, found.tree.data)
+
+
+def kept_fields(graph):
+    return type(graph.nodes).__dataclass_fields__
+
+
+def test_what_is_there_is_not_made_again_but_for_another_map_other_settings_or_other_code(
+    place, task, here, monkeypatch
+):
+    region = town_of(place, task)
+    first = asked(region, "chart", **SETTINGS)
+    assert asked(region, "chart", **SETTINGS) == first
+    assert len(here) == 1
+    others = [asked(region, "chart", **SETTINGS | {"reach_m": 5.0}), asked(region, "graph")]
+    for name in ("_code", "_versions"):
+        monkeypatch.setattr(kept, name, lambda: "changed")
+        others.append(asked(region, "chart", **SETTINGS))
+    assert len({first, *others}) == len(here) == 5
+    assert None not in others
+
+
+def test_nothing_is_given_of_a_map_that_was_built_anew(place, task, here):
+    region = town_of(place, task)
+    assert kept.kept_of(region, "graph", {}, digest="0" * 64, timeout_s=600.0) is None
+    assert here == []
+    with pytest.raises(kept.StoreError, match="was built anew meanwhile"):
+        keeper.make(region, kept.shelf_of(region) / "one", "graph", {}, digest="0" * 64)
+    assert not (kept.shelf_of(region) / "one").exists()
+
+
+def test_every_statement_of_a_manifest_counts(place, task):
+    manifest = read_manifest(town_of(place, task))
+    extract = manifest.extract.model_copy(update={"date": manifest.extract.date.replace(year=1999)})
+    changed = [
+        manifest.model_copy(update=update)
+        for update in ({"extract": extract}, {"rows": manifest.rows + 1}, {"files": {}}, {"classes": ("water",)})
+    ]
+    assert len({one.digest for one in (manifest, *changed)}) == len(changed) + 1
+    assert manifest.digest == read_manifest(town_of(place, task)).digest
+
+
+@pytest.mark.parametrize("damage", ["shorter", "missing", "unfinished"])
+def test_what_was_damaged_is_made_again(damage, place, task, here):
+    folder = asked(town_of(place, task), "chart", **SETTINGS)
+    path = folder / ("kept.json" if damage == "unfinished" else "known.npy")
+    if damage == "shorter":
+        os.truncate(path, 100)
+    else:
+        path.unlink()
+    assert asked(town_of(place, task), "chart", **SETTINGS) == folder
+    assert len(here) == 2
+    assert len(np.load(folder / "known.npy"))
+
+
+def test_a_matcher_makes_what_was_removed_meanwhile(place, task):
+    region = read_region(town_of(place, task), with_layers=False)
+    vars(region)["keep"] = lambda *_: place / "nowhere"
+    assert Chart.of(region).used().any()
+    assert len(MappedGraph.of(region).nodes)
+    assert read_field(region, likeness_by_hand(region.classes)).known.any()
+
+
+def test_a_part_of_a_map_is_not_taken_for_the_whole(place, task):
+    region = read_region(town_of(place, task), with_layers=False)
+    vars(region)["keep"] = pytest.fail
+    (part,) = region.cuts([(0, 0, 64, 64)])
+    assert Chart.of(part).degree.shape[1:] == (64, 64)
+    assert MappedGraph.of(region.within(region.coverage.buffer(-100.0))).known.any()
+
+
+def test_what_was_not_asked_for_longest_is_removed_first(place, task, here, monkeypatch):
+    region = town_of(place, task)
+    folders = [asked(region, "chart", thin=[], reach_m=float(at)) for at in range(4)]
+    for at, folder in enumerate(folders):
+        os.utime(folder / "kept.json", (at, at))
+    size = sum(path.stat().st_size for path in folders[0].iterdir())
+    asked(region, "chart", thin=[], reach_m=0.0)  # asked for again
+    monkeypatch.setenv("SASGEO_KEPT_MB", str(int(4.5 * size / 1e6)))
+    more = asked(region, "chart", thin=[], reach_m=9.0)
+    assert [folder.is_dir() for folder in (*folders, more)] == [True, False, True, True, True]
+    monkeypatch.setenv("SASGEO_KEPT_MB", "0")
+    assert asked(region, "chart", thin=[], reach_m=0.0) is None
+    assert len(here) == 5
+
+
+def test_without_a_folder_that_can_be_written_nothing_is_kept(place, task, here, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert kept.shelf_of(town_of(place, task)) is None
+    assert asked(town_of(place, task), "graph") is None
+    assert here == []
+
+
+def replies(place, task, spec):
+    """The replies of a matcher in a process of its own to the preparation and the first query."""
+    region = town_of(place, task)
+    query = task_files.query_bytes(next(iter(task_files.read_queries(task))))
+    reach = Reach(readable=[region], hidden=[place / "out" / "truth"])
+    with Worker(spec=spec, reach=reach, limits=Limits(match_s=600.0, memory_bytes=10**9)) as worker:
+        return worker.prepare(region), worker.match(query, top_k=5)
+
+
+def test_a_matcher_answers_by_what_is_kept_as_without(place, task, shelf, monkeypatch):
+    first = replies(place, task, "sasgeo_prior")
+    folders = sorted(shelf.glob("*/*/"))
+    assert len(folders) == 2  # a field and a graph
+    again = replies(place, task, "sasgeo_prior")
+    assert sorted(shelf.glob("*/*/")) == folders
+    monkeypatch.setenv("SASGEO_KEPT_MB", "0")
+    without = replies(place, task, "sasgeo_prior")
+    assert [reply.status for reply in (*first, *again, *without)] == ["ok"] * 6
+    assert first[1].found == again[1].found == without[1].found
+
+
+@shut_in
+def test_a_matcher_reads_what_is_kept_of_its_map_alone_and_changes_nothing(place, task, shelf):
+    (shelf / "another map").mkdir(parents=True)
+    ready, found = replies(place, task, "hostile:ReadsWhatIsKept")
+    assert ready.status == "ok", ready.message
+    assert found.found.diagnostics == {"is there": 1.0, "other maps": 0.0, "written": 0.0, "nonsense": 0.0}
+
+
+def test_a_process_that_has_seen_a_query_is_given_nothing(place, task, here):
+    region = town_of(place, task)
+    query = task_files.query_bytes(next(iter(task_files.read_queries(task))))
+    with Threaded(spec="graph_only", reach=Reach(readable=[region], hidden=[]), limits=Limits()) as worker:
+        assert worker.prepare(region).status == "ok"
+        assert len(here) == 1
+        assert worker.match(query, top_k=1).status == "ok"
+        for path in kept.shelf_of(region).iterdir():
+            kept.remove_tree(path)
+        assert worker.prepare(region).status == "ok"
+    assert len(here) == 1
+
+
+def test_a_size_that_is_none_is_told_once_and_the_usual_one_holds(monkeypatch):
+    told = []
+    monkeypatch.setattr(kept, "tell", told.append)
+    monkeypatch.setenv("SASGEO_KEPT_MB", "1 GB")
+    assert [kept.most_bytes() for _ in range(2)] == [kept.MOST_MB * 10**6] * 2
+    assert told == ["SASGEO_KEPT_MB is '1 GB', no whole number of megabytes: 4000 are kept at most"]
+
+
+def test_a_matcher_that_asks_for_something_else_is_refused(place, task):
+    ready, _ = replies(place, task, "hostile:AsksForWhatIsNotKept")
+    assert (ready.status, "an answer that is none" in ready.message) == ("invalid", True)

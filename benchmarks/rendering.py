@@ -3,13 +3,14 @@
 
     .venv/bin/python benchmarks/rendering.py --out out
     .venv/bin/python benchmarks/rendering.py --out out --region vaduz --views 40    # a real place: SASGEO_EXTRACTS
+    .venv/bin/python benchmarks/rendering.py --out out --crops 400
 
 Builds the region where it is not in `--out`. One window is painted once; then views of 768 x 768 pixels are taken at
 places, headings and heights (120 to 220 m) drawn for each, with drawn conditions (haze, exposure, blur, motion, noise,
-JPEG; one season and one sun, as shadows belong to the painted scene). Crops are those of `drawn_crops`, with all
-ingredients and with none, and of `real_crops` where the region has imagery; opening windows counts. OpenCV runs on one
-thread. Seconds are of the processor, so that other load counts little; memory is the peak resident size with imports
-and region (Linux).
+JPEG; one season and one sun, as shadows belong to the painted scene). Crops, if asked for, are those of `drawn_crops`,
+with all ingredients and with none, and of `real_crops` where the region has imagery; opening windows counts. OpenCV
+runs on one thread. Seconds are of the processor, so that other load counts little; memory is the peak resident size
+with imports and region (Linux).
 """
 
 import argparse
@@ -49,7 +50,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--region", default="town-riverside")
     parser.add_argument("--views", type=int, default=24)
-    parser.add_argument("--crops", type=int, default=400)
+    parser.add_argument("--crops", type=int, default=0, help="of each kind; default: none")
     parser.add_argument("--extracts", type=Path, default=Path(os.environ.get("SASGEO_EXTRACTS", ".")))
     said = parser.parse_args()
     cv2.setNumThreads(1)
@@ -68,11 +69,17 @@ def main() -> None:
         seconds = [_seconds(scene, middle, tilt_deg, number) for number in range(said.views)]
         median, slow = np.median(seconds), np.quantile(seconds, 0.9)
         print(f"tilt {tilt_deg:2g} deg: {1 / median:5.1f} views a CPU second (median; slowest tenth {1 / slow:.1f})")
-    _measure_crops("drawn crops", drawn_crops([region], seed=1), said.crops)
-    _measure_crops("without ingredients", drawn_crops([region], seed=1, ingredients=Ingredients.none()), said.crops)
-    if region.imagery is not None:
-        _measure_crops("real crops", real_crops([region], seed=1), said.crops)
+    for title, crops in _kinds_of_crops(region) if said.crops else ():
+        _measure_crops(title, crops, said.crops)
     print(f"peak memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6:.0f} MB")
+
+
+def _kinds_of_crops(region: Region) -> Iterator[tuple[str, Iterator[Crop]]]:
+    """Yield crops by title, those of a window that is painted and of imagery where there is some."""
+    yield "drawn crops", drawn_crops([region], seed=1)
+    yield "without ingredients", drawn_crops([region], seed=1, ingredients=Ingredients.none())
+    if region.imagery is not None:
+        yield "real crops", real_crops([region], seed=1)
 
 
 def _measure_crops(title: str, crops: Iterator[Crop], count: int) -> None:

@@ -33,7 +33,11 @@ KEPT: Final = "{kept}"  # a folder of the commit, in which its regions and tasks
 BASE: Final = "{base}"  # the checkout of the base: both commits score its stored boards
 PLACES: Final = {  # name -> region whose extracts it has, and what its file says otherwise
     "square": ("vaduz", {"id": '"square"', "size_m": "[12288, 12288]"}),
-    "faroes": ("torshavn", {"id": '"faroes"', "center_lonlat": "[-6.97, 61.895]", "size_m": "[81920, 120832]"}),
+    "faroes": (
+        "torshavn",
+        # Cells of 2 m: a region file may not ask for as many as of 1 m
+        {"id": '"faroes"', "center_lonlat": "[-6.97, 61.895]", "size_m": "[81920, 120832]", "cell_size_m": "2.0"},
+    ),
 }
 VADUZ: Final = ("build-region", "vaduz", "--out", KEPT)
 
@@ -227,6 +231,7 @@ class Checkout:
         elif given[0] != "make":
             given = [str(binaries / "sasgeo-bench"), *given]
         path = {"PATH": f"{binaries}:{os.environ['PATH']}", "PYTHONPATH": str(self.root)}
+        path["PYTHONDONTWRITEBYTECODE"] = ""  # as with a user, modules are compiled once
         with (self.root.parent / f"{self.name}.log").open("ab") as log:
             return subprocess.Popen(given, cwd=self.root, env=os.environ | path, stdout=into, stderr=log)  # noqa: S603 - our own programs
 

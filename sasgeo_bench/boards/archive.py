@@ -24,13 +24,13 @@ from sasgeo_bench.boards.elsewhere import asked_elsewhere
 from sasgeo_bench.boards.manifests import PackManifest
 from sasgeo_bench.boards.private_board import check_public
 from sasgeo_bench.boards.scored import Scored, ScoreRequest
-from sasgeo_bench.core.errors import ConfigError, ExtractError, SasgeoError, StoreError, counted
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import METRICS, check_registered, code_of
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
-from sasgeo_bench.osm.locate import cache_folder
 from sasgeo_bench.regions.region import LICENCE
+from sasgeo_bench.running.kept import FITS, kept_folder, most_bytes
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import Task
@@ -179,12 +179,9 @@ def request_of(
 
 
 def fits_folder() -> Path | None:
-    """Return the folder of the user's cache that keeps what rejectors made of answers; None without a cache.
-
-    It may be removed.
-    """
-    with suppress(ExtractError):
-        return cache_folder() / "rejectors"
+    """Return the folder of the user's cache that keeps what rejectors made of answers; None where nothing is kept."""
+    with suppress(StoreError):
+        return kept_folder().with_name(FITS) if most_bytes() else None
     return None
 
 

@@ -13,6 +13,7 @@ def main() -> None:
     with interrupted_by_signals():
         # Arrow's own pool keeps what was freed: 25 to 50 MB of a build.
         os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+        gc.disable()  # until a command is imported (`program.load`), of which nothing is garbage
         # A command makes hundreds of thousands of objects that stay: to look for cycles among them took a tenth of it.
         gc.set_threshold(100_000)
         try:
@@ -24,3 +25,6 @@ def main() -> None:
                 raise
             sys.stderr.write("sasgeo-bench: interrupted before it began; run it again\n")
             sys.exit(exit_interrupted())
+        finally:
+            # As it ends, the interpreter looks for cycles among all modules: a tenth of a build, which frees nothing.
+            gc.freeze()

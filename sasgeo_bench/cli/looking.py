@@ -106,8 +106,8 @@ def _preview(manifest: Manifest, folder: Path, out: Path) -> Path:
     """Return the picture of a map: that of the build, or one drawn now, for maps on the way to queries have none."""
     if PREVIEW in manifest.files:
         return folder / PREVIEW
-    from sasgeo_bench.regions.layers import read_overview  # noqa: PLC0415 - imports GDAL
-    from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview  # noqa: PLC0415
+    from sasgeo_bench.regions.layers import PREVIEW_CELLS, read_overview  # noqa: PLC0415 - imports GDAL
+    from sasgeo_bench.regions.preview import write_preview  # noqa: PLC0415
 
     path = sheet_path(out, "map", folder.name)
     path.parent.mkdir(parents=True, exist_ok=True)

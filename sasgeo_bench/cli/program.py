@@ -2,6 +2,7 @@
 """The program `sasgeo-bench`: parses, calls, prints."""
 
 import ast
+import gc
 import inspect
 import re
 import sys
@@ -167,6 +168,9 @@ def load(name: str) -> Any:  # noqa: ANN401 - typer makes its commands of a clas
     alone = typer.Typer(add_completion=False, context_settings=_HELP_WORDS)
     function = getattr(import_module(f"sasgeo_bench.cli.{file}"), _function_of(name))
     alone.command(name)(_with_outlets(with_flags(function)))
+    if not gc.isenabled():  # the program has put it off until all is imported, which stays
+        gc.freeze()
+        gc.enable()
     return typer.main.get_command(alone)
 
 

@@ -4,7 +4,7 @@
 import datetime as dt
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -162,14 +162,14 @@ class ClassTable(Document):
 
 def extract_folders(given: Sequence[Path] = ()) -> tuple[Path, ...]:
     """Return the folders to search for extracts, in order: those given, SASGEO_EXTRACTS, the user's cache."""
-    found = _named_folders(given)
+    found = [*given, *_named_by(FOLDERS_VARIABLE)]
     with suppress(ExtractError):  # a user without a home has no cache
         found.append(cache_folder())
     return tuple(found)
 
 
-def _named_folders(given: Sequence[Path]) -> list[Path]:
-    return [*given, *map(Path, filter(None, os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep)))]
+def _named_by(variable: str) -> list[Path]:
+    return [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
 
 
 def imagery_folders(given: Sequence[Path] = (), *, extracts: Sequence[Path] = ()) -> tuple[Path, ...]:
@@ -181,8 +181,8 @@ def imagery_folders(given: Sequence[Path] = (), *, extracts: Sequence[Path] = ()
     >>> Path("data/imagery") in imagery_folders(extracts=[Path("data/osm")])
     True
     """
-    named = [Path(folder) for folder in os.environ.get(IMAGERY_VARIABLE, "").split(os.pathsep) if folder]
-    return (*given, *named, *(folder.parent / "imagery" for folder in _named_folders(extracts)))
+    beside = (folder.parent / "imagery" for folder in (*extracts, *_named_by(FOLDERS_VARIABLE)))
+    return (*given, *_named_by(IMAGERY_VARIABLE), *beside)
 
 
 def named_files(name: str, folders: Sequence[Path], *, has_folders: bool = False) -> list[Path]:
@@ -193,7 +193,7 @@ def named_files(name: str, folders: Sequence[Path], *, has_folders: bool = False
 
 def cache_folder() -> Path:
     """Return the folder of downloaded extracts; raise `ExtractError` if the user has no cache."""
-    import pooch  # noqa: PLC0415 - only downloads need it
+    import pooch  # noqa: PLC0415 - only downloads, and what they left, need it
 
     try:
         return Path(pooch.os_cache("sasgeo-bench"))
@@ -226,10 +226,12 @@ def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
     raise ExtractError(_not_found(extract, folders, wrong + failures))
 
 
-def _places(extract: Extract, folders: Sequence[Path]) -> list[Path]:
-    """Return where the file of an extract may lie on this machine."""
-    places = [folder / extract.file for folder in extract_folders(folders)]
-    return places + (named_files(extract.file, imagery_folders(extracts=folders)) if extract.format != "osm" else [])
+def _places(extract: Extract, folders: Sequence[Path]) -> Iterator[Path]:
+    """Yield where the file of an extract may lie on this machine, the user's cache not before it is asked for."""
+    yield from (folder / extract.file for folder in (*folders, *_named_by(FOLDERS_VARIABLE)))
+    yield cache_folder() / extract.file
+    if extract.format != "osm":
+        yield from named_files(extract.file, imagery_folders(extracts=folders))
 
 
 def missing_files(extracts: Iterable[Extract], *, folders: Sequence[Path] = ()) -> tuple[str, ...]:

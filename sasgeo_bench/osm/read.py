@@ -57,10 +57,13 @@ def cuts_by_box(path: Path, scan: Scan, objects: Geometries) -> Callable[[shapel
         def flat(geometry: Any) -> Any:  # noqa: ANN401 - one geometry or an array
             return shapely.transform(geometry, lambda lonlat: (lonlat - [west, south]) * scale)
 
-        things, box, area = flat(objects), flat(header), flat(found)
-        lines, ends = (flat(shapes) for shapes in _through_ways(path))
-        if _ends_inside(lines, ends, things, area=area, box=box):
+        box, area = flat(header), flat(found)
+        lines, ends = _through_ways(path, scan)
+        ends = ends[_is_far_inside(flat(ends), area=area, box=box)]
+        at_ends = objects[np.unique(overlapping(ends, objects)[1])]  # by their boxes: far fewer than all
+        if _ends_inside(flat(lines), flat(ends), flat(at_ends), area=area, box=box):
             return False
+        things = flat(objects)
         coast = flat(shapely.from_wkb(np.array(scan.coast, dtype=object)))
         sea = shapely.union_all(find_shore(coast, box).sea)
         # 0.25 of the box: around a small island in a large box there may be others, cut away
@@ -73,14 +76,14 @@ def cuts_by_box(path: Path, scan: Scan, objects: Geometries) -> Callable[[shapel
     return is_cut
 
 
-def _through_ways(path: Path) -> tuple[Geometries, Geometries]:
+def _through_ways(path: Path, scan: Scan) -> tuple[Geometries, Geometries]:
     """Return open ways of the classes that lead somewhere, and the ends at which they should meet others, degrees."""
     taxonomy = load_taxonomy()
     rules = [rule for name in taxonomy.having("through") for rule in taxonomy[name].rules if rule.geometry == "line"]
     wanted = osmium.filter.TagFilter(*((rule.key, value) for rule in rules for value in (*rule.widths, *rule.values)))  # noqa: PD011 - of a rule, not of a frame
-    ways = osmium.FileProcessor(str(path)).with_locations()
+    ways = osmium.FileProcessor(str(path), osmium.osm.WAY).with_filter(wanted).with_filter(scan.locator())
     found, is_stream = [], []
-    for way in elements(ways.with_filter(osmium.filter.EntityFilter(osmium.osm.WAY)).with_filter(wanted)):
+    for way in elements(ways):
         wkb = None if way.is_closed() else joined_wkb(way)
         if wkb is not None:
             found.append(wkb)
@@ -90,15 +93,19 @@ def _through_ways(path: Path) -> tuple[Geometries, Geometries]:
     return lines, np.concatenate([starts, shapely.get_point(lines, -1)])
 
 
+def _is_far_inside(ends: Geometries, *, area: shapely.Geometry, box: shapely.Geometry) -> NDArray[np.bool_]:
+    """Return which ends lie far from the sides of the box, and near the edge of the data or beyond it."""
+    edge = shapely.boundary(area)
+    shapely.prepare((edge, area))
+    is_far = shapely.contains(box, ends) & (shapely.distance(ends, shapely.boundary(box)) > LONGEST_M)
+    return np.asarray(is_far & (shapely.dwithin(edge, ends, LONGEST_M) | ~shapely.intersects(area, ends)))
+
+
 def _ends_inside(
     lines: Geometries, ends: Geometries, objects: Geometries, *, area: shapely.Geometry, box: shapely.Geometry
 ) -> bool:
-    """Return whether lines that lead somewhere end at the edge of the data instead, far from the sides of the box."""
-    if not len(lines):
-        return False
+    """Return whether lines that lead somewhere end at the edge of the data instead: their ends far inside the box."""
     crossings = int(shapely.intersects(lines, shapely.boundary(box)).sum())
-    ends = ends[shapely.contains(box, ends) & (shapely.distance(ends, shapely.boundary(box)) > LONGEST_M)]
-    ends = ends[(shapely.distance(ends, shapely.boundary(area)) <= LONGEST_M) | ~shapely.intersects(ends, area)]
     end, _ = overlapping(ends, objects, predicate="intersects")
     loose = ends[np.bincount(end, minlength=len(ends)) <= 1]
     outside = int((~shapely.intersects(loose, area)).sum())

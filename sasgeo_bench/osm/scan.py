@@ -94,7 +94,7 @@ class Scan:
 
     `far` holds geometry outside the requested box or without a class: it still shows what is mapped. `coast` holds
     every coastline of the file, `gaps` the gaps of ways of a class, by way id, `built_up` the areas near the box whose
-    landuse says that people live or work there.
+    landuse says that people live or work there. `nodes` holds the places of the nodes of an OSM file.
     """
 
     rows: list[ScanRow] = field(default_factory=list)
@@ -104,6 +104,13 @@ class Scan:
     built_up: list[bytes] = field(default_factory=list)
     traits: list[Traits] = field(default_factory=list)
     tally: Tally = field(default_factory=Tally)
+    nodes: osmium.index.LocationTable = field(default_factory=lambda: osmium.index.create_map("flex_mem"))
+
+    def locator(self) -> osmium.NodeLocationsForWays:
+        """Return what gives ways the places of their nodes, which are read once: they are most of a file."""
+        locator = osmium.NodeLocationsForWays(self.nodes)
+        locator.ignore_errors()  # of nodes that the file lacks
+        return locator
 
 
 class Classifier:
@@ -314,7 +321,7 @@ def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box) -> Scan:
     ways: set[int] = set()
     relations: set[int] = set()
     with uncollected():
-        for item in _ways_and_areas(path, taxonomy):
+        for item in _ways_and_areas(path, taxonomy, scan.nodes):
             if not item.is_area():
                 _scan_way(item, scan, classifier, expected, box)
             elif _scan_area(item, scan, classifier, box):  # an area without a ring stays among the lost
@@ -327,10 +334,10 @@ def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box) -> Scan:
     return scan
 
 
-def _ways_and_areas(path: Path, taxonomy: Taxonomy) -> Iterator[Any]:
+def _ways_and_areas(path: Path, taxonomy: Taxonomy, nodes: osmium.index.LocationTable) -> Iterator[Any]:
     """Yield ways with a key of lines and all areas, in one pass; filters and assembly of areas run in C++."""
     with_key = osmium.filter.KeyFilter(*taxonomy.keys)
-    processor = osmium.FileProcessor(str(path)).with_locations().with_areas(with_key)
+    processor = osmium.FileProcessor(str(path)).with_locations(nodes).with_areas(with_key)  # type: ignore[arg-type] # it takes a table, too
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
     lines = osmium.filter.KeyFilter(*taxonomy.keys_of("line"))
     lines.enable_for(osmium.osm.WAY)
@@ -470,7 +477,7 @@ class _LostPass:
         bare = {identifier for identifier, relation in relations.items() if not relation.labels}
         cut = {ref for key in relations.keys() - bare for ref in relations[key].ways}
         everything = self.lost.ways | cut | {ref for key in bare for ref in relations[key].ways}
-        for item in _ways_and_relations(path, everything, bare):
+        for item in _ways_and_relations(path, everything, bare, self.scan):
             if not item.is_area():
                 self._read_way(item, is_cut=item.id in cut)
             else:
@@ -539,11 +546,12 @@ class _LostPass:
             scan.tally.notes["multipolygon of the old style: it has the tags of its outer ways"] += 1
 
 
-def _ways_and_relations(path: Path, ways: set[int], relations: set[int]) -> Iterator[Any]:
+def _ways_and_relations(path: Path, ways: set[int], relations: set[int], scan: Scan) -> Iterator[Any]:
     """Yield ways by id, and the areas of relations by id: osmium assembles areas only if there are any."""
-    processor = osmium.FileProcessor(str(path)).with_locations()
-    if relations:
-        processor = processor.with_areas(_of_ids("relation", relations))
+    if not relations:
+        processor = osmium.FileProcessor(str(path), osmium.osm.WAY)
+        return elements(processor.with_filter(_of_ids("way", ways)).with_filter(scan.locator()))
+    processor = osmium.FileProcessor(str(path)).with_locations().with_areas(_of_ids("relation", relations))
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
     areas = {(2 * abs(identifier) + 1) * (1 if identifier > 0 else -1) for identifier in relations}
     return elements(processor.with_filter(kinds).with_filter(_of_ids("way", ways)).with_filter(_of_ids("area", areas)))

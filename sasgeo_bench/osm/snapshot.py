@@ -5,7 +5,7 @@ import datetime as dt
 from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from shutil import copyfileobj
 from typing import Any, Final
@@ -29,6 +29,7 @@ _GZIP_MARK: Final = b"\x1f\x8b"
 _BZIP2_MARK: Final = b"BZh"
 _EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium returns 1970-01-01 for an object without a time
 _MOST_FEATURES: Final = 16  # that a header lists; all known ones are four
+_KINDS: Final = {"n": 0, "w": 1, "r": 2}
 OBJECTS: Final = osmium.osm.NODE | osmium.osm.WAY | osmium.osm.RELATION  # changesets have no versions
 
 
@@ -118,8 +119,7 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
             warnings.append("it is named like a full history, and holds one version of each object: read as it stands")
         if is_past or survey.repeated or survey.deleted:
             current = scratch / "at-date.osm.pbf"
-            _cut_history(content, current, at=at if is_past else None)
-            survey = _survey(current)
+            survey = _cut_history(content, current, at=at if is_past else None)
         _check_ids(path, survey, at=at if is_past else None)
         if survey.has_negative or survey.has_places:
             source, current = current, scratch / "plain.osm.pbf"
@@ -305,53 +305,78 @@ class _Survey:
         return self.is_flagged or self.has_versions or (is_named and self.deleted > 0)
 
 
+@dataclass(slots=True, kw_only=True)
+class _Found:
+    """Objects in the order of a file: type (0 node, 1 way, 2 relation, osmium's order), id and version."""
+
+    kinds: "array[int]" = field(default_factory=lambda: array("q"))
+    ids: "array[int]" = field(default_factory=lambda: array("q"))
+    versions: "array[int]" = field(default_factory=lambda: array("q"))
+
+    def add(self, item: Any, version: int) -> None:  # noqa: ANN401 - an object of osmium
+        self.kinds.append(_KINDS[item.type_str()])
+        self.ids.append(item.id)
+        self.versions.append(version)
+
+    def survey(self, *, deleted: int = 0, has_places: bool) -> _Survey:
+        number, kind = np.array(self.ids, dtype=np.int64), np.array(self.kinds, dtype=np.int64)
+        # osmium's order: by type, negative ids first, then by the size of the id.
+        keys = np.column_stack((kind, number > 0, np.abs(number)))
+        order = np.lexsort(keys.T[::-1])
+        is_again = (keys[order][1:] == keys[order][:-1]).all(axis=1)
+        version = np.array(self.versions, dtype=np.int64)[order]
+        return _Survey(
+            is_flagged=False,
+            is_sorted=bool((order == np.arange(len(order))).all()),
+            has_versions=bool((is_again & (version[1:] != version[:-1])).any()),
+            has_negative=bool((number < 0).any()),
+            largest_id=max(-int(number.min()), int(number.max())) if len(number) else 0,
+            has_places=has_places,
+            repeated=int(is_again.sum()),
+            deleted=deleted,
+        )
+
+
 def _survey(path: Path) -> _Survey:
     """Look at all objects once; at no nodes of a file that is sorted by its header: they are many."""
     header = _header_of(path)
     if header.has_multiple_object_versions:
         return _Survey(is_flagged=True)
-    kinds, ids, versions = array("q"), array("q"), array("q")
-    deleted, has_places = 0, False
-    # A PBF file says so in its header if ways may carry places: to look at all their nodes takes longer than all else
-    features = {header.get(f"pbf_optional_feature_{number}") for number in range(_MOST_FEATURES)}
-    may_have_places = _is_xml(path) or "LocationsOnWays" in features
+    found, deleted, has_places = _Found(), 0, False
+    may_have_places = _may_have_places(path, header)
     wanted = osmium.osm.WAY | osmium.osm.RELATION if header.get("sorting") == "Type_then_ID" else OBJECTS
     for item in elements(osmium.FileProcessor(str(path), wanted)):
-        kinds.append(("n", "w", "r").index(item.type_str()))  # in osmium's order
-        ids.append(item.id)
-        versions.append(item.version)
+        found.add(item, item.version)
         deleted += not item.visible
-        if may_have_places and not has_places and item.is_way():
-            has_places = any(node.location.valid() for node in item.nodes)
-    number = np.array(ids, dtype=np.int64)
-    # osmium's order: by type, negative ids first, then by the size of the id.
-    keys = np.column_stack((np.array(kinds, dtype=np.int64), number > 0, np.abs(number)))
-    order = np.lexsort(keys.T[::-1])
-    is_again = (keys[order][1:] == keys[order][:-1]).all(axis=1)
-    version = np.array(versions, dtype=np.int64)[order]
-    return _Survey(
-        is_flagged=False,
-        is_sorted=bool((order == np.arange(len(order))).all()),
-        has_versions=bool((is_again & (version[1:] != version[:-1])).any()),
-        has_negative=bool((number < 0).any()),
-        largest_id=max(-int(number.min()), int(number.max())) if len(number) else 0,
-        has_places=has_places,
-        repeated=int(is_again.sum()),
-        deleted=deleted,
-    )
+        has_places = has_places or (may_have_places and _has_places(item))
+    return found.survey(deleted=deleted, has_places=has_places)
 
 
-def _cut_history(path: Path, target: Path, *, at: dt.date | None) -> None:
+def _may_have_places(path: Path, header: osmium.io.Header) -> bool:
+    """Return whether ways may carry the places of their nodes: to look at all of them takes longer than all else."""
+    features = {header.get(f"pbf_optional_feature_{number}") for number in range(_MOST_FEATURES)}
+    return _is_xml(path) or "LocationsOnWays" in features
+
+
+def _has_places(item: Any) -> bool:  # noqa: ANN401 - an object of osmium
+    return item.is_way() and any(node.location.valid() for node in item.nodes)
+
+
+def _cut_history(path: Path, target: Path, *, at: dt.date | None) -> _Survey:
     """Write the last version of each object by the end of a day, or of all times, unless that one is deleted."""
     until = dt.datetime.combine(at or dt.date.max, dt.time.max, tzinfo=dt.UTC)
-    kept = _versions_at(path, until=until)
+    kept = iter(_versions_at(path, until=until).tolist())
+    found, has_places, may_have_places = _Found(), False, _may_have_places(path, _header_of(path))
     # File to write to that keeps the places of nodes on ways, where there are any
     with osmium.SimpleWriter(osmium.io.File(str(target), "pbf,locations_on_ways=true"), overwrite=True) as writer:
-        position = 0
+        following = next(kept, None)
         for number, item in enumerate(elements(osmium.FileProcessor(str(path), OBJECTS))):
-            if position < len(kept) and kept[position] == number:
+            if number == following:
                 writer.add(item)
-                position += 1
+                found.add(item, 0)  # one version of each
+                has_places = has_places or (may_have_places and _has_places(item))
+                following = next(kept, None)
+    return found.survey(has_places=has_places)
 
 
 def _write_plain(path: Path, target: Path) -> None:
@@ -396,10 +421,18 @@ def _positive(identifier: int) -> int:
 
 def _versions_at(path: Path, *, until: dt.datetime) -> NDArray[np.int64]:
     """Return positions in the file, ascending, of the versions alive at a time; versions may come in any order."""
-    latest: dict[tuple[str, int], tuple[int, int, bool]] = {}
+    found, numbers, alive = _Found(), array("q"), bytearray()
     for number, item in enumerate(elements(osmium.FileProcessor(str(path), OBJECTS))):
         if item.timestamp <= until:
-            key, version = (item.type_str(), item.id), item.version
-            if key not in latest or version >= latest[key][0]:
-                latest[key] = (version, number, item.visible)
-    return np.sort(np.array([number for _, number, is_visible in latest.values() if is_visible], dtype=np.int64))
+            found.add(item, item.version)
+            numbers.append(number)
+            alive.append(item.visible)
+    # Of an object the newest version, of equal ones that which stands last, sorts last
+    kind, identifier, version, position = (
+        np.array(each, dtype=np.int64) for each in (found.kinds, found.ids, found.versions, numbers)
+    )
+    order = np.lexsort((position, version, identifier, kind))
+    is_newest = np.ones(len(order), dtype=bool)
+    is_newest[:-1] = (np.diff(kind[order]) != 0) | (np.diff(identifier[order]) != 0)
+    newest = order[is_newest]
+    return np.sort(position[newest[np.frombuffer(alive, dtype=np.bool_)[newest]]])

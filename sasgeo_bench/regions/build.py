@@ -5,7 +5,7 @@ import datetime as dt
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial, reduce
@@ -16,9 +16,9 @@ from typing import Final
 import cv2
 import geopandas as gpd
 import numpy as np
+import scipy  # its parts are loaded where they are used: few regions have imagery
 import shapely
 from numpy.typing import NDArray
-from scipy import fft
 
 from sasgeo_bench.core.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.core.folders import file_record, fresh_folder, locked, scratch_folder, sha256_of
@@ -33,7 +33,17 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.imagery import OFFSET_VERSION, ORTHO, Imagery, OffsetRecord, OrthoRecord, find_imagery
-from sasgeo_bench.regions.layers import PaintWindow, burn, burn_mapped, make_paint, read_overview, write_layers
+from sasgeo_bench.regions.layers import (
+    PREVIEW_CELLS,
+    PaintWindow,
+    burn,
+    burn_mapped,
+    make_paint,
+    overview_factors,
+    read_overview,
+    shown_factor,
+    write_layers,
+)
 from sasgeo_bench.regions.ortho import Picture, check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.region import (
     DATA_VERSION,
@@ -300,16 +310,25 @@ def _write_into(
 ) -> Manifest:
     """Burn the layers, make the graph, and write all files of a region."""
     classes, terms = plan.spec.class_names, {"credit": plan.spec.credit, "licence": plan.spec.licence}
-    # GDAL packs blocks without holding the interpreter, so the layers are written while the graph is made.
+    shown: Future[None] = Future()  # the level that the preview shows is in its file
+    factor = shown_factor(max(plan.grid.shape), overview_factors(plan.grid), longest_cells=PREVIEW_CELLS)
+
+    def filled(level: int) -> None:
+        if level == factor:
+            shown.set_result(None)
+
+    # Blocks are packed without holding the interpreter, so the layers are written while all else is made.
     with ThreadPoolExecutor(max_workers=1) as executor:
         paint = partial(_painter, reading, plan.grid, classes)
-        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint, **terms)
+        layers = executor.submit(
+            partial(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint, filled=filled, **terms)
+        )
         graph = build_graph(reading.features, bounds_m=plan.grid.bounds_m)
         region_files.write_tables(scratch, reading.features, graph, **terms)
         manifest = make_manifest(plan, extract, reading, graph)
+        if plan.with_preview and shown in wait((shown, layers), return_when=FIRST_COMPLETED).done:
+            _write_preview(scratch, manifest)
         layers.result()
-    if plan.with_preview:
-        _write_preview(scratch, manifest)
     files = {path.name: file_record(path) for path in sorted(scratch.iterdir())}
     manifest = manifest.model_copy(update={"files": files, "imagery": imagery})
     region_files.write_manifest(scratch, manifest)
@@ -415,10 +434,14 @@ def _mend(plan: BuildPlan, kept: Manifest) -> Manifest | None:
 
 
 def _write_preview(folder: Path, manifest: Manifest) -> None:
-    from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview  # noqa: PLC0415 - only a picture needs matplotlib
+    from sasgeo_bench.regions.preview import write_preview  # noqa: PLC0415 - only a picture needs matplotlib
 
-    overview = read_overview(folder / region_files.LAYERS, longest_cells=PREVIEW_CELLS)
-    write_preview(folder / region_files.PREVIEW, manifest=manifest, overview=overview)
+    layers = folder / region_files.LAYERS
+    write_preview(
+        folder / region_files.PREVIEW,
+        manifest=manifest,
+        overview=read_overview(layers, longest_cells=PREVIEW_CELLS),
+    )
 
 
 @contextmanager
@@ -618,10 +641,10 @@ def _doubled(values: NDArray[np.float32], step_m: float) -> Complex:
 def _correlation(on_map: _Edges, seen: _Edges) -> Surface:
     """Return the sum of products for each offset; the picture is larger than the map by the reach on each side."""
     template, picture = on_map.field, seen.field
-    shape = tuple(fft.next_fast_len(size) for size in picture.shape)
-    product = fft.fft2(picture, shape) * np.conj(fft.fft2(template, shape))
+    shape = tuple(scipy.fft.next_fast_len(size) for size in picture.shape)
+    product = scipy.fft.fft2(picture, shape) * np.conj(scipy.fft.fft2(template, shape))
     count = picture.shape[0] - template.shape[0] + 1
-    return np.asarray(fft.ifft2(product)[:count, :count].real)
+    return np.asarray(scipy.fft.ifft2(product)[:count, :count].real)
 
 
 def _clear_peak_m(surface: Surface, step_m: float) -> tuple[float, float] | None:

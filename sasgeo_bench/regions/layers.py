@@ -22,9 +22,6 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import Delaunay
 from tifffile import TiffFile, TiffPage, TiffWriter
 
 from sasgeo_bench.core.errors import ImageryError, SasgeoError, StoreError
@@ -303,9 +300,19 @@ def groups_within(shapes: Shapes, gap_m: float) -> Ints:
         return np.empty(0, dtype=np.int64)
     left, right = _near_pairs(shapes, gap_m).T
     is_near = shapely.dwithin(shapes[left], shapes[right], gap_m)
-    links = coo_array((is_near, (left, right)), shape=(len(shapes), len(shapes)))
-    links.eliminate_zeros()
-    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+    return _components(len(shapes), left[is_near], right[is_near])
+
+
+def _components(count: int, left: Ints, right: Ints) -> Ints:
+    """Number the components of a graph by their first nodes, shape (count,)."""
+    # scipy has it as well, and takes a sixth of a second to import
+    first, before = np.arange(count), np.empty(0, dtype=np.int64)
+    while not np.array_equal(first, before):
+        before = first.copy()
+        for one, other in ((left, right), (right, left)):
+            np.minimum.at(first, first[one], first[other])
+        first = first[first]
+    return np.asarray(np.unique(first, return_inverse=True)[1], dtype=np.int64)
 
 
 def touching_pairs(shapes: Shapes) -> Ints:
@@ -351,7 +358,7 @@ def delaunay_pairs(en_m: Floats, longest_m: float) -> Ints:
 
 def _strict_pairs(en_m: Floats) -> Ints:
     """Return edges of the triangulation whose two opposite angles sum to less than a half turn."""
-    corners = Delaunay(en_m).simplices.astype(np.int64)
+    corners = _triangles(en_m)
     tip = corners.ravel()
     base = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2).reshape(-1, PLANE))
     arms = en_m[base] - en_m[tip][:, None]
@@ -364,6 +371,21 @@ def _strict_pairs(en_m: Floats) -> Ints:
     is_hull = uses == 1
     is_strict = np.bincount(edge, weights=cotangent) > 1e-6  # sum of two cotangents that counts as 0, dimensionless
     return np.asarray(base[first][is_hull | is_strict])
+
+
+def _triangles(en_m: Floats) -> Ints:
+    """Return the rows of the corners of the Delaunay triangles, shape (T, 3)."""
+    places, row = np.unique(en_m, axis=0, return_index=True)
+    if len(places) < len(en_m):
+        # Of several at one place a corner is one, which Qhull names: most maps have none, and need not wait for scipy
+        from scipy.spatial import Delaunay  # noqa: PLC0415 - as above
+
+        return np.asarray(Delaunay(en_m).simplices, dtype=np.int64)
+    triangles = shapely.get_parts(shapely.delaunay_triangles(shapely.multipoints(places)))
+    corners = shapely.get_coordinates(triangles).reshape(-1, TRIANGLE + 1, PLANE)[:, :TRIANGLE]
+    kind = [("east", np.float64), ("north", np.float64)]
+    order = np.searchsorted(places.view(kind)[:, 0], np.ascontiguousarray(corners).view(kind)[..., 0])
+    return np.asarray(row[order], dtype=np.int64)
 
 
 PRESENT: Final = 1
@@ -447,17 +469,20 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
            [  0,   1,   1, 255],
            [  0,   0,   0, 255]], dtype=uint8)
     """
-    layers = np.zeros((len(paint.classes), grid.rows, grid.cols), dtype=np.uint8)
-    outside = None
-    if not shapely.covers(paint.ground, shapely.box(*grid.bounds_m)).any():
-        outside = np.where(burn(paint.coverage, grid), np.uint8(0), np.uint8(OUTSIDE))
-    for index, band in enumerate(layers):
-        seen = burn_class(paint, index, grid)
-        if seen is not None:
-            band[...] = seen
-        if outside is not None:
-            np.maximum(band, outside, out=band)
+    layers = np.empty((len(paint.classes), *grid.shape), dtype=np.uint8)
+    for band, burnt in zip(layers, _burn_bands(paint, grid), strict=True):
+        band[...] = burnt
     return layers
+
+
+def _burn_bands(paint: Paint, grid: Grid) -> Iterator[NDArray[np.uint8]]:
+    """Burn one class after the other; those of which none is near share one array, and most are such."""
+    ground = np.zeros(grid.shape, dtype=np.uint8)
+    if not shapely.covers(paint.ground, shapely.box(*grid.bounds_m)).any():
+        ground[~burn(paint.coverage, grid)] = OUTSIDE
+    for index in range(len(paint.classes)):
+        seen = burn_class(paint, index, grid)
+        yield ground if seen is None else np.maximum(ground, seen.view(np.uint8))
 
 
 def burn_class(paint: Paint, index: int, grid: Grid) -> NDArray[np.bool_] | None:
@@ -478,14 +503,16 @@ def burn_class(paint: Paint, index: int, grid: Grid) -> NDArray[np.bool_] | None
     name = paint.classes[index]
     seen, cover = burn(near, grid), load_taxonomy().covers.get(name)
     if cover in paint.classes:
+        covered = burn(paint.near(paint.classes.index(cover), grid), grid)
         above = paint.above.get(name, _NO_AREAS)
-        seen &= ~burn(paint.near(paint.classes.index(cover), grid), grid) | burn(above, grid)
+        seen &= ~(covered & ~burn(above, grid) if len(above) else covered)
     return seen
 
 
-def burn_mapped(paint: Paint, grid: Grid) -> NDArray[np.uint8] | None:
-    """Burn a window as `burn_layers` does; None where nothing of it is mapped."""
-    return burn_layers(paint, grid) if shapely.intersects(paint.ground, shapely.box(*grid.bounds_m)).any() else None
+def burn_mapped(paint: Paint, grid: Grid) -> list[NDArray[np.uint8]] | None:
+    """Burn a window as `burn_layers` does, an array for each class; None where nothing of it is mapped."""
+    is_mapped = shapely.intersects(paint.ground, shapely.box(*grid.bounds_m)).any()
+    return list(_burn_bands(paint, grid)) if is_mapped else None
 
 
 def _meets(bounds: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:
@@ -516,7 +543,7 @@ def burn(areas: NDArray[np.object_], grid: Grid) -> NDArray[np.bool_]:
     """
     row, col, step = _crossings(areas, grid)
     position = row * grid.cols + col
-    order = np.argsort(position, kind="stable")
+    order = np.argsort(position)  # in which order several at one place come makes no difference
     is_inside = np.cumsum(step[order]) > 0
     edges = np.concatenate(([0], position[order], [grid.rows * grid.cols]))
     runs = np.repeat(np.concatenate(([False], is_inside)), np.diff(edges))
@@ -529,22 +556,25 @@ def _crossings(
     """Return row, first column at or right of the crossing, and sign, for every edge and every row's centre line."""
     rings = shapely.get_rings(areas)
     points, ring = shapely.get_coordinates(rings, return_index=True)
-    uv = grid.to_uv(points)
-    joined = ring[1:] == ring[:-1]
-    start, end = uv[:-1][joined], uv[1:][joined]
+    northing_m, (_, south_m, _, north_m) = points[:, 1], grid.bounds_m
+    lower_m, upper_m = np.minimum(northing_m[:-1], northing_m[1:]), np.maximum(northing_m[:-1], northing_m[1:])
+    # Most edges of a sea or a country lie in no row of a window.
+    near = np.flatnonzero((ring[1:] == ring[:-1]) & (lower_m < north_m) & (upper_m > south_m))
+    start, end = grid.to_uv(points[near]), grid.to_uv(points[near + 1])
     # A row's centre line lies at row + 0.5; an edge crosses those in [upper end, lower end).
     first = np.clip(np.ceil(np.minimum(start[:, 1], end[:, 1]) - 0.5), 0, grid.rows).astype(np.int64)
     last = np.clip(np.ceil(np.maximum(start[:, 1], end[:, 1]) - 0.5), 0, grid.rows).astype(np.int64)
     count = last - first
-    edge = np.repeat(np.arange(len(count)), count)
-    row = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + first[edge]
-    is_down = (end[:, 1] > start[:, 1])[edge]
+    is_down = end[:, 1] > start[:, 1]
     # From its upper end, whichever way the ring runs: two parcels round the place on a shared edge alike.
-    upper = np.where(is_down[:, None], start[edge], end[edge])
-    across = np.where(is_down[:, None], end[edge], start[edge]) - upper
-    u = upper[:, 0] + (row + 0.5 - upper[:, 1]) * across[:, 0] / across[:, 1]
-    col = np.clip(np.ceil(u - 0.5), 0, grid.cols).astype(np.int64)
-    return row, col, np.where(is_down, 1, -1)
+    upper = np.where(is_down[:, None], start, end)
+    across = np.where(is_down[:, None], end, start) - upper
+    edge = np.repeat(np.arange(len(count)), count)
+    row = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count - first, count)
+    (u, v), (du, dv) = upper.T, across.T
+    crossed_u = u[edge] + (row + 0.5 - v[edge]) * du[edge] / dv[edge]
+    col = np.clip(np.ceil(crossed_u - 0.5), 0, grid.cols).astype(np.int64)
+    return row, col, np.where(is_down, 1, -1)[edge]
 
 
 BLOCK_CELLS: Final = 512
@@ -556,7 +586,8 @@ _BIGTIFF_CELLS: Final = 2**31  # compressed, such a file stays far below the 4 G
 
 In = TypeVar("In")
 Out = TypeVar("Out")
-PaintWindow = Callable[[Grid], NDArray[np.uint8] | None]  # None where nothing is mapped
+Burnt = Iterable[NDArray[np.uint8]]  # an array of shape (rows, cols) for each class
+PaintWindow = Callable[[Grid], Burnt | None]  # None where nothing is mapped
 
 
 def overview_factors(grid: Grid) -> tuple[int, ...]:
@@ -573,11 +604,13 @@ def write_layers(
     *,
     credit: str = ATTRIBUTION,
     licence: str = LICENCE,
+    filled: Callable[[int], None] = lambda _factor: None,
 ) -> None:
     """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
-    `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (C, rows,
-    cols), or None where nothing is mapped. The next level is painted in another thread while one is burnt.
+    `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (rows,
+    cols) for each class, or None where nothing is mapped. The next level is painted in another thread while one is
+    burnt. `filled` is given the factor of each level, the coarsest first, once it can be read.
 
     A cloud-optimized file holds its overviews before the full raster, smallest first. GDAL's own COG driver writes
     everything twice to get there, and its empty overviews are made by reading the empty raster. Here all levels are
@@ -592,6 +625,7 @@ def write_layers(
             painters = _in_turn(painting, paint, (factor for factor, _ in levels))
             for (factor, page), burn_window in zip(levels, painters, strict=True):
                 _fill(page, grid.coarsen(factor), burn_window, packing)
+                filled(factor)
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except (RasterioError, OSError) as error:
@@ -661,20 +695,25 @@ def _fill(page: TiffPage, grid: Grid, burn_window: PaintWindow, packing: ThreadP
     for name, values in zip(("TileOffsets", "TileByteCounts"), places, strict=True):
         page.tags[name].overwrite(values.ravel().tolist())
     page.tags["Compression"].overwrite(_ZSTD)
+    file.flush()
 
 
-def _packed(layers: NDArray[np.uint8] | None) -> list[tuple[tuple[int, int, int], bytes]]:
+def _packed(bands: Burnt | None) -> list[tuple[tuple[int, int, int], bytes]]:
     """Pack the blocks of a window that hold mapped ground, each with its band, row and column among the blocks."""
-    if layers is None:
-        return []
+    kept = [] if bands is None else list(bands)
+    # An array that several classes share is packed once
+    packed = {number: _packed_band(band) for number, band in {id(band): band for band in kept}.items()}
+    return [((number, *place), block) for number, band in enumerate(kept) for place, block in packed[id(band)]]
+
+
+def _packed_band(band: NDArray[np.uint8]) -> list[tuple[tuple[int, int], bytes]]:
     found = []
-    for at in itertools.product(range(len(layers)), *(range(0, side, BLOCK_CELLS) for side in layers.shape[1:])):
-        band, top, left = at
-        block = layers[band, top : top + BLOCK_CELLS, left : left + BLOCK_CELLS]
+    for top, left in itertools.product(*(range(0, side, BLOCK_CELLS) for side in band.shape)):
+        block = band[top : top + BLOCK_CELLS, left : left + BLOCK_CELLS]
         lowest, highest = int(block.min()), int(block.max())
         if lowest == OUTSIDE:
             continue
-        place = (band, top // BLOCK_CELLS, left // BLOCK_CELLS)
+        place = (top // BLOCK_CELLS, left // BLOCK_CELLS)
         found.append((place, _packed_plain(lowest) if lowest == highest else _packed_block(block)))
     return found
 
@@ -703,19 +742,33 @@ def _in_turn(pool: ThreadPoolExecutor, work: Callable[[In], Out], items: Iterabl
         yield ahead.popleft().result()
 
 
+PREVIEW_CELLS: Final = 2048  # of `preview.png`, along the longest side
+
+
+def shown_factor(longest: int, factors: Sequence[int], *, longest_cells: int) -> int:
+    """Return the factor of the finest level of which the longer side has at most `longest_cells`, else the coarsest.
+
+    `longest` is the longer side of the map itself, in cells, and `factors` are those of its overviews.
+
+    >>> shown_factor(5000, [4, 16], longest_cells=2048), shown_factor(2000, [4], longest_cells=2048)
+    (4, 1)
+    """
+    levels = (1, *factors)
+    return next((factor for factor in levels if longest / factor <= longest_cells), levels[-1])
+
+
 def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
-    """Read the finest level whose longer side has at most `longest_cells`; shape (C, rows, cols).
+    """Read the level of a `shown_factor`; shape (C, rows, cols).
 
     Raise `StoreError` if the file cannot be read.
     """
     try:
         with open_geotiff(path) as source:
             longest, factors = max(source.height, source.width), source.overviews(1)
-        fitting = [level for level, factor in enumerate(factors) if longest / factor <= longest_cells]
-        if longest <= longest_cells or not factors:
+        chosen = shown_factor(longest, factors, longest_cells=longest_cells)
+        if chosen == 1:
             return read_layers(path)
-        chosen = fitting[0] if fitting else len(factors) - 1
-        with open_geotiff(path, overview_level=chosen) as source:
+        with open_geotiff(path, overview_level=factors.index(chosen)) as source:
             return np.asarray(source.read(), dtype=np.uint8)
     except (RasterioError, OSError) as error:
         raise _unreadable(path, error) from error

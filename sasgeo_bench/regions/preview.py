@@ -4,28 +4,31 @@
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from textwrap import wrap
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import RendererBase
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from sasgeo_bench.core.canvas import PlainFigure
 from sasgeo_bench.core.errors import check_given
+from sasgeo_bench.core.texts import plain
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import OUTSIDE
 from sasgeo_bench.regions.painting import UNMAPPED, paint_overview, pooled
 from sasgeo_bench.regions.region import Manifest, Region
 
 _DPI: Final = 110
-PREVIEW_CELLS: Final = 2048  # of `preview.png`, along the longest side
 _MOST_CELLS: Final = 1024  # of a figure, along a side: more are no more to see
 _LEGEND_INCHES: Final = 2.9
 _MAP_INCHES: Final = 9.6
@@ -75,9 +78,11 @@ def plot_region(region: Region) -> Figure:
 
 def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]) -> None:
     """Draw a region to a PNG; `overview` is a coarse level of the layers, uint8 of shape (C, rows, cols)."""
-    _drawn(manifest, overview).savefig(
-        path, metadata={"Title": manifest.title, "Copyright": manifest.attribution, "Software": None}, format="png"
-    )
+    canvas: Any = FigureCanvasAgg(_drawn(manifest, overview))  # whose printing has no types
+    del overview  # twice the memory of the picture
+    # `savefig` would draw everything twice
+    words = {"Title": plain(manifest.title), "Copyright": plain(manifest.attribution), "Software": None}
+    canvas.print_png(path, metadata=words)
 
 
 def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
@@ -92,11 +97,11 @@ def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
     side_m = (cols * _cell_m(manifest, overview), rows * _cell_m(manifest, overview))
     west_m, _, _, north_m = manifest.bounds_m
     extent = (west_m, west_m + side_m[0], north_m - side_m[1], north_m)  # what fills no whole cell lies south and east
-    # With an alpha of its own matplotlib draws it in a third of the memory
-    picture = cv2.cvtColor(paint_overview(manifest, overview), cv2.COLOR_RGB2RGBA)
-    is_smaller = max(rows, cols) > _MAP_INCHES * _DPI
-    chart.imshow(picture, extent=extent, interpolation="antialiased" if is_smaller else "nearest")
-    chart.set_anchor("NW")
+    picture = _Picture(chart, extent=extent)
+    picture.set_data(cv2.cvtColor(paint_overview(manifest, overview), cv2.COLOR_RGB2RGBA))
+    picture.set_clip_path(chart.patch)
+    chart.add_image(picture)
+    chart.set_aspect("equal", anchor="NW")
     west, south, east, north = manifest.bounds_m
     frame = shapely.boundary(shapely.box(west, south, east, north))
     edge = shapely.difference(shapely.boundary(shapely.from_wkt(manifest.coverage.wkt)), shapely.buffer(frame, 0.5))
@@ -117,6 +122,26 @@ def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
     _words(figure, manifest, total)
     _legend(figure, manifest, overview, left=(_LEFT_INCHES + width + 0.15) / total[0], top=1 - _TITLE_INCHES / total[1])
     return figure
+
+
+class _Picture(AxesImage):
+    """A picture that is resampled as bytes: matplotlib does it in floats, and takes fifteen times its memory."""
+
+    def make_image(
+        self,
+        renderer: RendererBase,
+        magnification: float = 1.0,
+        unsampled: bool = False,  # noqa: FBT001, FBT002 - as in matplotlib
+    ) -> tuple[NDArray[Any], float, float, Affine2D]:
+        """Return the picture in pixels of the figure, and its lower left corner there."""
+        picture, frame = np.asarray(self.get_array()), np.array(self.axes.bbox.size) * magnification
+        extents = np.array(self.get_window_extent(renderer).extents) * magnification
+        left, bottom, right, top = np.rint(extents).astype(int).tolist()
+        size = (max(right - left, 1), max(top - bottom, 1))
+        if size[0] > 2 * frame[0] or size[1] > 2 * frame[1]:  # of a part alone, there is no need of all pixels
+            return super().make_image(renderer, magnification, unsampled)
+        rule = cv2.INTER_AREA if size[0] < picture.shape[1] else cv2.INTER_NEAREST
+        return cv2.resize(picture, size, interpolation=rule)[::-1], left, bottom, Affine2D()
 
 
 def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m_per_inch: float) -> None:

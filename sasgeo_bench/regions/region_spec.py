@@ -18,6 +18,7 @@ from sasgeo_bench.core.config import (
     find_document,
     list_documents,
     read_document,
+    shipped_dir,
     toml_value,
 )
 from sasgeo_bench.core.errors import ConfigError, GridError
@@ -343,7 +344,9 @@ class RegionFile(NamedDocument):
     def origin(self) -> Provenance:
         """Return the lines of provenance, with those sources that are no extract."""
         further = [*filter(None, [self.provenance.further_sources]), *(one.credit for one in self.own_map)]
-        stated = {name: getattr(self.provenance, name) for name in self.provenance.model_fields_set}
+        # In the order of the fields: a set has another one in each process, and so would the file
+        given = [name for name in Provenance.model_fields if name in self.provenance.model_fields_set]
+        stated = {name: getattr(self.provenance, name) for name in given}
         return Provenance(**stated | ({"further_sources": "; ".join(further)} if further else {}))
 
     @property
@@ -473,6 +476,10 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
         ...
     sasgeo_bench.core.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions or new-region)
     """
+    # A file that ships is named by its id, so that the hundreds of others need not be read.
+    shipped = shipped_dir("regions") / f"{id_or_path}.toml"
+    if not folders and shipped.name == f"{id_or_path}.toml" and shipped.is_file():
+        return shipped
 
     def known() -> dict[str, Path]:
         return {path.stem: path for path in sorted(OWN_FOLDER.glob("*.toml"))} | list_region_files(folders=folders)

@@ -31,6 +31,7 @@ from sasgeo_bench.regions.region_files import read_manifest
 VARIABLE: Final = "SASGEO_KEPT_MB"  # most megabytes that are kept; 0 keeps nothing
 MOST_MB: Final = 4000
 LEAST_CELLS: Final = 2048**2  # of a map: a smaller one is made in less time than a process takes to start
+FITS: Final = "rejectors"  # the folder beside it (`boards.archive`)
 ABOUT: Final = "kept.json"  # written last: sizes of the other files
 _MAKER: Final = "sasgeo_bench.running.keeper"
 _LEFT_S: Final = 86_400  # nothing is made for a day: what is older was left by a process that was killed
@@ -39,14 +40,14 @@ _LEFT_S: Final = 86_400  # nothing is made for a day: what is older was left by 
 def kept_folder() -> Path:
     """Return the folder of all that is kept, in the user's cache (`XDG_CACHE_HOME`); it may be removed at any time.
 
-    Links are followed. Raise `StoreError` if the user has no cache.
+    Raise `StoreError` if the user has no cache.
     """
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
-        named = Path(os.environ.get("XDG_CACHE_HOME", ""))
         cache_home = named if named.is_absolute() else Path.home() / ".cache"
-        return (cache_home / "sasgeo-bench" / "maps").resolve()
-    except (RuntimeError, OSError) as error:  # a user who is only a number, as in containers, or links in a circle
-        raise StoreError(f"you have no cache ({one_line(str(error))}): name a folder by XDG_CACHE_HOME") from error
+    except RuntimeError as error:  # of a user who is only a number, as in containers
+        raise StoreError("you have no home, and so no cache: name a folder by XDG_CACHE_HOME") from error
+    return cache_home / "sasgeo-bench" / "maps"
 
 
 def most_bytes() -> int:
@@ -63,10 +64,10 @@ def _most_mb(text: str) -> int:
 
 def shelf_of(region: Path) -> Path | None:
     """Return the folder of what is kept of a map, made now; None for a small map, or where nothing can be kept."""
-    with suppress(SasgeoError, OSError):
+    with suppress(SasgeoError, OSError, RuntimeError):  # the last one of links in a circle
         manifest = read_manifest(region)
         if _is_worth_it(manifest):
-            shelf = kept_folder() / manifest.digest
+            shelf = kept_folder().resolve() / manifest.digest
             shelf.mkdir(mode=0o700, parents=True, exist_ok=True)  # a map may be private
             return shelf
     return None

@@ -46,7 +46,7 @@ from sasgeo_bench.matching.matcher import (
 from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.failures import LOG, is_disk_error, our_failure
-from sasgeo_bench.running.kept import kept_folder, kept_of, shelf_of
+from sasgeo_bench.running.kept import FITS, kept_folder, kept_of, shelf_of
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import LEAN, WATCH_S, Group, MemoryWatch
@@ -599,11 +599,11 @@ def _shelf(region: Path) -> Path | None:
 
 
 def _open_cache(code: Sequence[Path]) -> list[str]:
-    """Return the user's cache if it lies where plugins read, as where their home is the working folder."""
+    """Return the parts of the user's cache that lie where plugins read, as where their home is the working folder."""
     with contextlib.suppress(StoreError):
-        cache = kept_folder().parent  # what rejectors made of answers lies there, too
-        if any(cache.is_relative_to(os.path.realpath(path)) for path in (*map(str, code), *sandbox.SYSTEM)):
-            return [str(cache)]
+        parts = [os.path.realpath(path) for path in (kept_folder(), kept_folder().with_name(FITS))]
+        around = [os.path.realpath(path) for path in (*map(str, code), *sandbox.SYSTEM)]
+        return [part for part in parts if any(Path(part).is_relative_to(path) for path in around)]
     return []
 
 

@@ -2,8 +2,10 @@
 """Flights of a suite over a region, and their queries and truths: views in order, with odometry between them."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -35,9 +37,9 @@ from sasgeo_bench.tasks.query import (
     flight_id,
     view_id,
 )
-from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, Job, drawn_share, make_prior
+from sasgeo_bench.tasks.sampling import KEPT_BYTES, LEAST_DRAWN, UNANSWERABLE, Drafts, Job, drawn_share, make_prior
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.state import State, share_of
 from sasgeo_bench.tasks.suites.base import (
     EVERYTHING,
     Choice,
@@ -473,19 +475,25 @@ class FlightDrawer:
         Pictures are drawn place by place, since a place is painted once.
         """
         if not self.suite.is_pictured:
+            drafts = Drafts(asked=Counter(map(self._alike, jobs)), room_bytes=KEPT_BYTES)
             for job in jobs:
-                yield from self._flown(job)
+                yield from self._flown(job, drafts)
+                drafts.leave(self._alike(job))
             return
         found: dict[str, list[tuple[Query, Truth]]] = {job.query_id: [] for job in jobs}
         for site in dict.fromkeys(job.site.index for job in jobs):
             own = [job for job in jobs if job.site.index == site]
-            for pairs in zip(*map(self._flown, own), strict=True):
+            for pairs in zip(*(self._flown(job, Drafts()) for job in own), strict=True):
                 for job, pair in zip(own, pairs, strict=True):
                     found[job.query_id].append(pair)
         for job in jobs:
             yield from found[job.query_id]
 
-    def _flown(self, job: Job) -> Iterator[tuple[Query, Truth]]:
+    def _alike(self, job: Job) -> Hashable:
+        """Return what all flights have in common whose views are the same where they are at the same place."""
+        return (job.site.index, self.suite.look(job.variant), self.suite.mission(job.variant).draw)
+
+    def _flown(self, job: Job, drafts: Drafts) -> Iterator[tuple[Query, Truth]]:
         mission, flight = self.suite.mission(job.variant), self.flights[job.site.index]
         before = self._elsewhere(flight, mission.carried_m) if mission.carried_m else None
         views = flight.views if before is None else _joined(before, flight)
@@ -514,7 +522,11 @@ class FlightDrawer:
                 least_m = 0.0 if frame else GNSS_M
                 fix = gnss.disc(frame, (place_m[0], place_m[1]), least_m=least_m)
                 own |= {GNSS_OFF: round(float(gnss.away_m[frame]), 1)} if fix[0] is not None else {}
-            yield self._view(job, pose_of(views, frame, flight.scale), step, measured=own | measured, fix=fix)
+            pose = pose_of(views, frame, flight.scale)
+            seeds = self._seeds(job.site).under("view", frame, *([mission.draw] if mission.draw else []))
+            request = self._request(job, pose, seeds)
+            draft = drafts.of(self._alike(job), (frame, pose), partial(self.suite.draw, request))
+            yield self._view(job, request.site, draft, step, measured=own | measured, fix=fix)
 
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:
         """Return what the odometer says: to the middle and from there on what it says in the control."""
@@ -552,15 +564,16 @@ class FlightDrawer:
             self.carried[key] = self.airspace.elsewhere(flight, carried_m)
         return self.carried[key]
 
+    def _request(self, job: Job, pose: Pose, seeds: Seeds) -> ViewRequest:
+        site = replace(job.site, pose=pose, density=drawn_share(self.scene.map, pose, job.variant))
+        flight_seeds = self._seeds(job.site)
+        return ViewRequest(scene=self.scene, site=site, variant=job.variant, seeds=seeds, flight_seeds=flight_seeds)
+
     def _view(
-        self, job: Job, pose: Pose, step: Step, *, measured: dict[str, float], fix: Disc | None
+        self, job: Job, site: Site, draft: QueryDraft, step: Step, *, measured: dict[str, float], fix: Disc | None
     ) -> tuple[Query, Truth]:
-        scene, variant, mission = self.scene, job.variant, self.suite.mission(job.variant)
-        group = mission.group or self.airspace.group
-        seeds = self._seeds(job.site)
-        of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
-        site = replace(job.site, pose=pose, density=drawn_share(scene.map, pose, variant))
-        draft = self.suite.draw(ViewRequest(scene=scene, site=site, variant=variant, seeds=of_view, flight_seeds=seeds))
+        scene, variant, pose, seeds = self.scene, job.variant, site.pose, self._seeds(job.site)
+        group = self.suite.mission(variant).group or self.airspace.group
         evidence = draft.evidence
         if not measured["is_seen"]:
             evidence = evidence.replace(np.full_like(evidence.cells, UNKNOWN))
@@ -609,7 +622,7 @@ class FlightDrawer:
             kind=variant.kind,
             strength=variant.strength,
             strength_unit=self.suite.card.strength_unit,
-            unknown_share=query.evidence.unknown_share,
+            unknown_share=share_of(query.evidence.cells == UNKNOWN),
             changed_share=changed,
             feature_density=site.density,
             alias_index=None,

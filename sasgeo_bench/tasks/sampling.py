@@ -2,8 +2,10 @@
 """Queries and truths of a suite at its sites: ids, priors, candidates and strata, the same for all suites."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -11,10 +13,10 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.regions.evidence import PRESENT
+from sasgeo_bench.regions.evidence import UNKNOWN, pack, unpack
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
+from sasgeo_bench.tasks.state import State, share_of
 from sasgeo_bench.tasks.suites.base import (
     EVERYTHING,
     Choice,
@@ -48,6 +50,7 @@ _GOLDEN: Final = math.pi * (3 - math.sqrt(5))  # golden angle: spreads points ev
 _TURNS: Final = 72
 _JITTER_M: Final = STRIDE_M / 2
 _ROUNDED_M: Final = 0.1  # resolution of a disc's centre
+KEPT_BYTES: Final = 2**26  # of drafts, packed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +61,68 @@ class Job:
     site: Site
     variant: Variant
     track: Track
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Kept:
+    """A draft without its cells, and these packed."""
+
+    draft: QueryDraft
+    shape: tuple[int, ...]
+    cells: bytes
+
+    @classmethod
+    def of(cls, draft: QueryDraft) -> "_Kept":
+        seen = draft.evidence
+        corner = seen.replace(seen.cells[:, :1, :1].copy())
+        return cls(draft=replace(draft, evidence=corner), shape=seen.cells.shape, cells=pack(seen.cells))
+
+    def whole(self) -> QueryDraft:
+        return replace(self.draft, evidence=self.draft.evidence.replace(unpack(self.cells, self.shape)))
+
+
+@dataclass(kw_only=True, eq=False)
+class Drafts:
+    """Drafts of views that are asked for several times, each drawn once: they are the same for every track, say.
+
+    They are kept by groups, packed, each until as many have left its group as `asked` says; all take `room_bytes` at
+    most, and what finds no room is drawn again.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.regions.evidence import Evidence
+    >>> def draw():
+    ...     print("drawn")
+    ...     cells = np.zeros((1, 2, 2), dtype=np.uint8)
+    ...     return QueryDraft(evidence=Evidence(classes=("water",), cells=cells, cell_size_m=1.0))
+    >>> drafts = Drafts(asked=Counter({"pair": 2}), room_bytes=1000)
+    >>> for _ in range(2):
+    ...     found = drafts.of("pair", "view", draw)
+    ...     drafts.leave("pair")
+    drawn
+    """
+
+    asked: Counter[Hashable] = field(default_factory=Counter)
+    room_bytes: int = 0
+    _kept: dict[Hashable, dict[Hashable, _Kept]] = field(default_factory=dict, init=False, repr=False)
+
+    def of(self, group: Hashable, view: Hashable, draw: Callable[[], QueryDraft]) -> QueryDraft:
+        """Return the draft of a view of a group."""
+        kept = self._kept.get(group, {}).get(view)
+        if kept is not None:
+            return kept.whole()
+        draft = draw()
+        is_plain = draft.vectors is None and not draft.frames and draft.evidence.confidence is None
+        if is_plain and self.asked[group] > 1 and self.room_bytes > 0:
+            kept = self._kept.setdefault(group, {})[view] = _Kept.of(draft)
+            self.room_bytes -= len(kept.cells)
+        return draft
+
+    def leave(self, group: Hashable) -> None:
+        """Count one who asks for the views of a group no more."""
+        self.asked[group] -= 1
+        if self.asked[group] <= 0:
+            self.room_bytes += sum(len(kept.cells) for kept in self._kept.pop(group, {}).values())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +185,8 @@ class Drawer:
     def drawn(self, jobs: Sequence[Job]) -> Iterator[tuple[Query, Truth]]:
         """Yield queries and truths in their order; pictures are drawn site by site, since a place is painted once."""
         if not self.suite.is_pictured:
-            yield from map(self.draw, jobs)
+            drafts = Drafts(asked=Counter(map(_alike, jobs)), room_bytes=KEPT_BYTES)
+            yield from (self._drawn(job, drafts) for job in jobs)
             return
         by_site = sorted(jobs, key=lambda job: (job.site.index, job.variant.detector, job.variant.name))
         found = {job.query_id: self.draw(job) for job in by_site}
@@ -128,8 +194,13 @@ class Drawer:
 
     def draw(self, job: Job) -> tuple[Query, Truth]:
         """Draw one query and its truth."""
+        return self._drawn(job, Drafts())
+
+    def _drawn(self, job: Job, drafts: Drafts) -> tuple[Query, Truth]:
         site, seeds = job.site, self._site_seeds(job.site)
-        draft = self.suite.draw(ViewRequest(scene=self.scene, site=site, variant=job.variant, seeds=seeds))
+        request = ViewRequest(scene=self.scene, site=site, variant=job.variant, seeds=seeds)
+        draft = drafts.of(_alike(job), None, partial(self.suite.draw, request))
+        drafts.leave(_alike(job))
         group = draft.group or self.group
         if job.track == "retrieval":  # a disc around the truth would show which of the candidates is right
             group = replace(group, radius_m=None)
@@ -197,7 +268,7 @@ class Drawer:
             kind=kind_of(variant.role, draft.kind or variant.kind, draft.measured),
             strength=variant.strength if draft.strength is None else draft.strength,
             strength_unit=self.suite.card.strength_unit,
-            unknown_share=draft.evidence.unknown_share,
+            unknown_share=share_of(draft.evidence.cells == UNKNOWN),
             changed_share=changed,
             feature_density=site.density if draft.density is None else draft.density,
             alias_index=decoys.alias_index if draft.has_pose and draft.pose is None else None,
@@ -259,11 +330,14 @@ class Drawer:
         return candidates(own, decoys_m, yaw_deg=yaw_deg, jitter_m=_JITTER_M, rng=rng)
 
 
+def _alike(job: Job) -> Hashable:
+    """Return what all queries of one draft have in common: they differ by their tracks."""
+    return (job.site.index, job.variant)
+
+
 def drawn_share(state: State, pose: Pose, variant: Variant) -> float:
     """Return the fraction of a view's cells in which a map shows a road, building, water or other drawn feature."""
-    view = variant.view(state, pose)
-    layers = [view.classes.index(name) for name in (*DRAWN_CLASSES, "water") if name in view.classes]
-    return float((view.cells[layers] == PRESENT).any(axis=0).mean())
+    return state.drawn_share(pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
 
 
 def _clusters(

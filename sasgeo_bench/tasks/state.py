@@ -4,11 +4,12 @@
 import datetime as dt
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
+from sasgeo_bench.regions.evidence import PRESENT, Evidence, LayerBits, observe
 from sasgeo_bench.regions.layers import read_bits
 from sasgeo_bench.regions.region import Lazy, MapGraph, Region
 
@@ -25,6 +26,19 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
 DRAWN_CLASSES: Final = load_taxonomy().having("drawn")
+BLOCK_M: Final = 8.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Blocks:
+    """A map in square blocks of about `BLOCK_M`: fractions of the mapped cells and of those of each class, 0..1.
+
+    Both have the shape of `grid`.
+    """
+
+    grid: Grid
+    known: NDArray[np.float32]
+    shares: dict[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +56,9 @@ class State:
     features: Lazy["gpd.GeoDataFrame"] = Lazy()  # noqa: RUF009 - no default: a field that may be a function
     graph: Lazy[MapGraph] = Lazy()  # noqa: RUF009
     coverage: shapely.Geometry
+    _drawn_shares: dict[tuple[Pose, int, float], float] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @classmethod
     def of(cls, region: Region, name: str | None = None, *, bits: LayerBits | None = None) -> "State":
@@ -70,6 +87,15 @@ class State:
         """Return what a perfect detector would see from a pose."""
         cells = observe(self.bits, self.grid, pose, size_cells=size_cells, cell_size_m=cell_size_m)
         return Evidence(classes=self.classes, cells=cells, cell_size_m=cell_size_m)
+
+    def drawn_share(self, pose: Pose, *, size_cells: int, cell_size_m: float) -> float:
+        """Return the fraction of a view's cells with one of `DRAWN_CLASSES`, or water; each view is counted once."""
+        key = (pose, size_cells, cell_size_m)
+        if key not in self._drawn_shares:
+            view = self.view(pose, size_cells=size_cells, cell_size_m=cell_size_m)
+            layers = [view.classes.index(name) for name in (*DRAWN_CLASSES, "water") if name in view.classes]
+            self._drawn_shares[key] = share_of((view.cells[layers] == PRESENT).any(axis=0))
+        return self._drawn_shares[key]
 
     @cached_property
     def known(self) -> NDArray[np.bool_]:
@@ -113,7 +139,36 @@ class State:
         return np.array([self.has(name).sum() for name in self.classes]) / max(1, int(self.known.sum()))
 
     @cached_property
+    def blocks(self) -> Blocks:
+        """Return the map in blocks."""
+        factor = max(1, round(BLOCK_M / self.grid.cell_size_m))
+        there, grid = int(np.bitwise_or.reduce(self.bits.bits, axis=None)), self.grid.coarsen(factor)
+        nothing = np.zeros(grid.shape, dtype=np.float32)
+        return Blocks(
+            grid=grid,
+            known=_mean_blocks(self.known, factor),
+            shares={
+                name: _mean_blocks(self.has(name), factor) if there >> at & 1 else nothing
+                for at, name in enumerate(self.classes)
+            },
+        )
+
+    @cached_property
     def drawn(self) -> NDArray[np.bool_]:
         """Return where any of `DRAWN_CLASSES` is present."""
         mask = np.uint32(sum(1 << self.classes.index(name) for name in DRAWN_CLASSES if name in self.classes))
         return np.asarray((self.bits.bits & mask).astype(bool) & self.known)
+
+
+def share_of(mask: NDArray[np.bool_]) -> float:
+    """Return the mean of a mask: to count it takes a quarter of the time."""
+    return np.count_nonzero(mask) / mask.size
+
+
+def _mean_blocks(mask: NDArray[np.bool_], factor: int) -> NDArray[np.float32]:
+    """Return the fraction of a mask in square blocks; the last blocks are padded with False."""
+    rows, cols = -(-mask.shape[0] // factor), -(-mask.shape[1] // factor)
+    padded = np.zeros((rows * factor, cols * factor), dtype=np.uint8)
+    np.multiply(mask, np.uint8(255), out=padded[: mask.shape[0], : mask.shape[1]])
+    found = cv2.resize(padded, (cols, rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(found, dtype=np.float32) / np.float32(255)

@@ -92,11 +92,21 @@ def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path
     assert contents_of(again) == {name: data for name, data in there.items() if name.parts[0] != "pictures"}
 
 
+def test_fits_are_kept_in_the_users_cache_unless_nothing_is_to_be_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("SASGEO_KEPT_MB", raising=False)
+    usual = archive.request_of([tmp_path / "runs"], board=tmp_path / "board", root=tmp_path)
+    assert usual.kept_fits == tmp_path / "sasgeo-bench" / "rejectors"
+    monkeypatch.setenv("SASGEO_KEPT_MB", "0")
+    assert archive.request_of([tmp_path / "runs"], board=tmp_path / "board", root=tmp_path).kept_fits is None
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_scored_once_more_no_rejector_is_fitted_and_the_board_is_the_same(kept, program, tmp_path, monkeypatch):
     _, _, folder, _ = kept
     monkeypatch.setattr(kept_rejection, "_programs", lambda: b"program")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("SASGEO_KEPT_MB")
     fitted, judge = [], rejection.judge
     monkeypatch.setattr(rejection, "judge", lambda *given, **more: fitted.append(given) or judge(*given, **more))
     for name in ("once", "twice"):

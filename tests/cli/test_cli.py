@@ -104,6 +104,29 @@ finally:
 """
 
 
+BUILD = """
+import atexit, gc, sys
+from sasgeo_bench.cli import main, program
+load, lean = program.load, []
+def loaded(name):
+    command = load(name)
+    lean.extend((gc.isenabled(), gc.get_freeze_count() > 10_000, collections() == before))
+    return command
+def collections():
+    return sum(each["collections"] for each in gc.get_stats())
+program.load, before = loaded, collections()
+late = {"scipy.sparse", "scipy.spatial", "scipy.ndimage", "scipy.fft", "pooch", "matplotlib", "pyogrio"}
+atexit.register(lambda: print(*lean, len(gc.get_objects()) < 1000, *late & set(sys.modules)))
+main()
+"""
+
+
+def test_no_garbage_is_looked_for_around_a_build_and_nothing_is_imported_that_few_need():
+    words = ["build-region", "vaduz", "--help"]
+    ended = subprocess.run([sys.executable, "-c", BUILD, *words], capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+    assert ended.stdout.splitlines()[-1] == "True True True True", ended.stderr
+
+
 def test_help_names_every_command_and_reads_the_code_of_none():
     ended = subprocess.run([sys.executable, "-c", HELP, "--help"], capture_output=True, text=True, check=False)  # noqa: S603 - our own program
     assert ended.returncode == 0, ended.stderr

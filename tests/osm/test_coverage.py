@@ -3,8 +3,9 @@
 
 import numpy as np
 import shapely
+from scipy import ndimage
 
-from sasgeo_bench.osm.coverage import choose_coverage, estimate_coverage
+from sasgeo_bench.osm.coverage import _closed, _largest, _opened, choose_coverage, estimate_coverage
 
 M_PER_DEG = 111_320.0
 COS_LATITUDE = float(np.cos(np.radians(47.0)))
@@ -45,6 +46,22 @@ def test_a_lake_within_is_covered_and_a_road_kept_whole_beyond_the_edge_and_left
     found = estimate_coverage(np.concatenate((scattered(COUNTRY), island)))
     assert metres_of(found).bounds[2] < 6000
     assert estimate_coverage(np.zeros((0, 2))).is_empty
+
+
+def test_cells_are_closed_opened_and_told_apart_as_by_distances():
+    rng = np.random.default_rng(0)
+    disc = np.hypot(*np.ogrid[-1:2, -1:2]) < 2
+    for share in np.repeat([0.003, 0.02, 0.1, 0.4], 20):
+        cells = np.pad(rng.random(rng.integers(9, 60, size=2)) < share, 4)
+        cells[5, 5] = True
+        near = ndimage.distance_transform_edt(~cells) <= 3  # cells: half of 600 m
+        closed = ndimage.binary_fill_holes(ndimage.distance_transform_edt(near) > 3)
+        assert (_closed(cells) == closed).all()
+        opened = ndimage.binary_opening(closed, disc)
+        assert (_opened(closed) == (opened if opened.any() else closed)).all()
+        labels, count = ndimage.label(closed)
+        sizes = ndimage.sum_labels(closed, labels, np.arange(1, count + 1))
+        assert (_largest(closed) == np.isin(labels, 1 + np.flatnonzero(sizes >= 0.02 * sizes.max()))).all()
 
 
 def test_of_an_extract_cut_along_a_border_the_header_is_only_the_frame():

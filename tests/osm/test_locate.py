@@ -58,6 +58,16 @@ def test_folders_are_searched_in_order_given_then_variable_then_cache(tmp_path, 
         assert find_extract(wanted(), folders=[tmp_path / "a"]).parent == tmp_path / name
 
 
+def test_the_cache_is_asked_for_only_where_no_other_folder_has_the_file(tmp_path, monkeypatch):
+    def refuse():
+        raise AssertionError
+
+    monkeypatch.setattr(locate, "cache_folder", refuse)
+    assert find_extract(wanted(), folders=[put(tmp_path / "a")]).parent == tmp_path / "a"
+    with pytest.raises(AssertionError):
+        find_extract(wanted(), folders=[tmp_path / "b"])
+
+
 def test_a_file_of_the_right_name_and_another_hash_is_passed_over(tmp_path):
     put(tmp_path / "wrong", b"other")
     put(tmp_path / "right")

@@ -30,6 +30,7 @@ from sasgeo_bench.regions.layers import (
     read_bits,
     read_layers,
     read_overview,
+    shown_factor,
     write_layers,
 )
 from sasgeo_bench.sensing.dem import read_dem
@@ -69,6 +70,21 @@ def test_what_is_read_is_what_was_burnt_and_a_window_is_read_alone(written):
     found = read_layers(written, window=(100, 200, 50, 60))
     assert (found == burn_layers(paint(), GRID)[:, 100:150, 200:260]).all()
     assert not found.flags.writeable
+
+
+def test_each_level_can_be_read_once_it_is_filled_the_coarsest_first(tmp_path, written):
+    path, drawn, found = tmp_path / "layers.tif", paint(), {}
+
+    def filled(factor):
+        longest = max(GRID.shape) // factor
+        found[factor] = read_overview(path, longest_cells=longest)
+
+    write_layers(path, GRID, CLASSES, lambda _: lambda window: burn_mapped(drawn, window), filled=filled)
+    assert list(found) == [*overview_factors(GRID)[::-1], 1]
+    for factor, level in found.items():
+        assert shown_factor(max(GRID.shape), overview_factors(GRID), longest_cells=max(GRID.shape) // factor) == factor
+        assert (level == burn_layers(drawn, GRID.coarsen(factor))).all()
+    assert path.read_bytes() == written.read_bytes()
 
 
 def test_ground_that_is_not_mapped_is_not_stored_and_reads_as_unknown(tmp_path):

@@ -58,12 +58,28 @@ def test_narrow_and_tiny_regions_are_drawn_too(tmp_path, manifest, shape):
     assert min(picture.shape[:2]) > 200
 
 
+def test_a_map_of_more_cells_than_pixels_is_averaged_and_a_part_of_it_is_drawn_too(tmp_path, manifest):
+    taxonomy, (west, south, *_) = load_taxonomy(), manifest.bounds_m
+    bounds = {"bounds_m": (west, south, west + 1500, south + 1500), "rows": 1500, "cols": 1500, "cell_size_m": 1.0}
+    manifest = manifest.model_copy(update=bounds)
+    overview = np.zeros((len(taxonomy.names), 1500, 1500), dtype=np.uint8)
+    overview[taxonomy["water"].id, :, :750] = PRESENT
+    picture = drawn(tmp_path, manifest, overview)
+    water, ground = (shares(picture, colour) for colour in (taxonomy["water"].colour, GROUND))
+    assert abs(water - ground) < 0.002  # the legend has a key of each class
+    figure = preview._drawn(manifest, overview)
+    figure.axes[0].set(xlim=(west, west + 10), ylim=(south, south + 10))
+    figure.savefig(tmp_path / "part.png")
+    part = (image.imread(tmp_path / "part.png")[..., :3] * 255).round().astype(int)
+    assert shares(part, taxonomy["water"].colour) > 0.4
+
+
 def test_the_axes_are_those_of_the_crs(manifest):
     empty = np.zeros((len(manifest.classes), manifest.rows, manifest.cols), np.uint8)
     chart = preview._drawn(manifest, empty).axes[0]
     west, south, east, north = manifest.bounds_m
     assert (chart.get_xlim(), chart.get_ylim()) == ((west, east), (south, north))
-    assert chart.images[0].get_extent() == [west, east, south, north]
+    assert chart.images[0].get_extent() == (west, east, south, north)
     assert f"EPSG:{manifest.epsg}" in chart.get_xlabel()
     chart.figure.canvas.draw()
     ticks = {label.get_text(): at for label, at in zip(chart.get_xticklabels(), chart.get_xticks(), strict=True)}

@@ -7,6 +7,7 @@ import pytest
 
 from sasgeo_bench.core.config import parse_toml
 from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.regions import region_spec
 from sasgeo_bench.regions.region_spec import OWN_FOLDER, RegionFile, find_region_file
 
 EXTRACT = f'[[extract]]\nfile = "a.osm.pbf"\ndate = 2020-01-01\nsha256 = ["{"0" * 64}"]\n'
@@ -107,3 +108,17 @@ def test_a_region_that_new_region_wrote_is_found_by_its_name_after_those_of_the_
     assert find_region_file("my-town", folders=[other.parent]) == other
     (OWN_FOLDER / "vaduz.toml").write_text(text().replace('"mine"', '"vaduz"'), encoding="utf-8")
     assert find_region_file("vaduz") != OWN_FOLDER / "vaduz.toml"
+
+
+def test_a_region_that_ships_is_found_without_reading_the_others(monkeypatch):
+    expected = region_spec.list_region_files()
+    monkeypatch.setattr(region_spec, "list_region_files", None)
+    assert find_region_file("vaduz") == expected["vaduz"]
+    monkeypatch.undo()
+    with pytest.raises(ConfigError, match="there is no region"):
+        find_region_file("../regions/vaduz")
+
+
+def test_lines_of_provenance_are_written_in_the_order_of_their_fields():
+    stated = '[provenance]\nsource = "a"\ndated_by = "b"\ncountry = "c"\nsurveyed_by = "d"\n'
+    assert list(read(text() + stated).origin.model_dump()) == ["surveyed_by", "country", "dated_by", "source"]

@@ -6,8 +6,18 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import Delaunay
 
-from sasgeo_bench.regions.layers import delaunay_pairs, find_bends, groups_within, long_sides, touching_pairs
+from sasgeo_bench.regions.layers import (
+    _components,
+    delaunay_pairs,
+    find_bends,
+    groups_within,
+    long_sides,
+    touching_pairs,
+)
 
 RULES = {"step_m": 10.0, "smoothing_m": 60.0, "window_m": 120.0, "turn_deg": 45.0}
 cells = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=12, unique=True)
@@ -60,6 +70,23 @@ def test_neighbours_do_not_depend_on_the_order_or_the_turn(cells: list, random) 
         return {frozenset((places[a], places[b])) for a, b in delaunay_pairs(en_m, 4.0)}
 
     assert named(cells, 1) == named(random.sample(cells, len(cells)), 0)
+
+
+@pytest.mark.parametrize("doubles", [0, 2])
+def test_neighbours_are_the_edges_of_the_triangles_of_qhull(doubles: int) -> None:
+    for seed in range(20):
+        en_m = np.random.default_rng(seed).normal(size=(80, 2)) * 100
+        en_m[:doubles] = en_m[40]  # houses drawn twice
+        corners = Delaunay(en_m - en_m.mean(axis=0)).simplices
+        edges = np.unique(np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0)
+        assert delaunay_pairs(en_m, 1e9).tolist() == edges.tolist()
+
+
+@given(links=st.lists(st.tuples(st.integers(0, 30), st.integers(0, 30)), max_size=40))
+def test_groups_are_numbered_by_their_first_shapes(links: list) -> None:
+    left, right = np.array(links, dtype=np.int64).reshape(-1, 2).T
+    table = coo_array((np.ones(len(left)), (left, right)), shape=(31, 31))
+    assert _components(31, left, right).tolist() == connected_components(table, directed=False)[1].tolist()
 
 
 @pytest.mark.parametrize(("longest_m", "pairs"), [(5.0, [[0, 2]]), (7.0, [[0, 2], [1, 2]]), (1.0, [])])

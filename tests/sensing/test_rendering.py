@@ -22,10 +22,11 @@ from sasgeo_bench.sensing.rendering.buildings import estimate_storeys
 from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun, cast_shadows, draw_conditions, expose, sun_at
 from sasgeo_bench.sensing.rendering.ground import WOOD, green_kinds
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
-from sasgeo_bench.sensing.rendering.plan import HeightPyramid, trace
+from sasgeo_bench.sensing.rendering.plan import CROWN, Canvas, HeightPyramid, burn_numbers, trace
 from sasgeo_bench.sensing.rendering.scene import Scene, make_scene, paint
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 from sasgeo_bench.sensing.rendering.texture import fractal, grain, noise
+from sasgeo_bench.sensing.rendering.trees import BROAD, BUSH, CONIFER, Trees, paint_trees
 from sasgeo_bench.sensing.rendering.view import labels, render, render_labelled, render_ortho
 from tests.drawn_features import features_of
 
@@ -212,6 +213,71 @@ def test_rays_meet_what_an_exhaustive_march_meets():
             run = np.hypot(*hits.ahead[:, row, col])
             assert hits.z_m[row, col] <= expected + 0.05
             assert (expected - hits.z_m[row, col]) * max(run, 0.05) < 6  # a corner of a cell may be cut
+
+
+def painted(trees, *, season: str, height_m=0.0):
+    """Height, kind and colour of a canvas after trees are painted on it, group by group."""
+    plan = village().plan
+    shape = plan.grid.shape
+    canvas = Canvas(
+        plan=plan,
+        season=season,
+        colour=np.zeros((*shape, 3), dtype=np.uint8),
+        height_m=np.full(shape, height_m, dtype=np.float32),
+        kind=np.zeros(shape, dtype=np.uint8),
+        owner=np.ones(shape, dtype=np.int32),
+    )
+    if trees:
+        paint_trees(canvas, trees)
+    return canvas
+
+
+def crowded(count: int, *, seed: int, side_m: float = 20.0) -> Trees:
+    """Trees that stand in each other's crowns; some are equal in all."""
+    rng = np.random.default_rng(seed)
+    kinds = rng.integers(0, 12, count)  # so many different ones
+    rng = np.random.default_rng(seed + 1)
+    return Trees(
+        at_m=(np.array([EAST, NORTH]) + rng.uniform(-side_m / 2, side_m / 2, (12, 2)))[kinds],
+        radius_m=rng.uniform(0.6, 4.0, 12)[kinds],
+        height_m=rng.uniform(1.0, 9.0, 12)[kinds],
+        form=rng.choice([BROAD, CONIFER, BUSH], 12)[kinds],
+        colour=rng.uniform(20, 200, (count, 3)),
+        luck=rng.uniform(0, 1, 12)[kinds],
+    )
+
+
+@pytest.mark.parametrize("season", ["summer", "winter"])
+def test_crowns_are_painted_as_one_by_one_from_the_lowest_and_group_by_group(season):
+    groups = crowded(60, seed=1), crowded(40, seed=5)
+    together = painted(groups, season=season, height_m=0.5)
+    canvas = painted((), season=season, height_m=0.5)
+    for trees in groups:
+        for tree in np.argsort(trees.height_m, kind="stable"):
+            paint_trees(canvas, [trees.part(np.array([tree]))])
+    assert (together.kind == CROWN).sum() > 500
+    for name in ("height_m", "kind", "owner", "colour"):
+        np.testing.assert_array_equal(getattr(together, name), getattr(canvas, name), name)
+    shown = together.kind == CROWN
+    assert (together.height_m[shown] > 0.5).all()
+    assert (together.height_m[~shown] == 0.5).all()
+    assert together.owner[shown].max() == 0
+
+
+def test_areas_are_numbered_as_shapely_holds_the_centres_of_cells_and_the_last_one_is_on_top():
+    grid = Grid.around(EAST, NORTH, size_m=(60.0, 40.0), cell_size_m=0.5, epsg=EPSG)
+    ring = shapely.Point(EAST + 3.2, NORTH - 1.1).buffer(17).difference(shapely.Point(EAST, NORTH).buffer(6))
+    parts = shapely.MultiPolygon([shapely.box(EAST - 29, NORTH + 3.1, EAST - 20.1, NORTH + 30), HOUSE])
+    beyond = shapely.box(EAST + 40, NORTH, EAST + 60, NORTH + 5)
+    areas = np.array([ring, shapely.Polygon(), beyond, None, parts], dtype=object)
+    centres = grid.to_centres_m(np.argwhere(np.ones(grid.shape, dtype=bool)))
+    expected = np.zeros(grid.shape, dtype=np.int32)
+    for number, area in enumerate(areas, 1):
+        if area is not None:
+            expected[shapely.contains_xy(area, *centres.T).reshape(grid.shape)] = number
+    found = burn_numbers(areas, grid)
+    np.testing.assert_array_equal(found, expected)
+    assert set(np.unique(found)) == {0, 1, 5}
 
 
 def test_what_a_crown_or_the_sky_hides_is_unknown_and_what_lies_beyond_the_map_too():

@@ -299,3 +299,17 @@ def test_a_failure_in_the_middle_of_a_flight_leaves_the_old_task_whole(own_out, 
     with pytest.raises(ZeroDivisionError):
         make(own_out, seed=1)
     assert {path.name: path.read_bytes() for path in made.folder.iterdir() if path.is_file()} == before
+
+
+@pytest.mark.usefixtures("short")
+def test_flights_drawn_together_are_those_drawn_one_by_one(airspace):
+    space = replace(airspace, suite=find_suite("flight-clean"))
+    flights = space.choose(count=1, may_be_fewer=False)
+    drawer = FlightDrawer.of(space, flights, Choice())
+    jobs = drawer.jobs([flight.site for flight in flights.values()])
+    together = list(drawer.drawn(jobs))
+    alone = [pair for job in jobs for pair in FlightDrawer.of(space, flights, Choice()).drawn([job])]
+    assert len({query.evidence.cells.tobytes() for query, _ in together}) < len(together)
+    for (query, truth), (first, its_truth) in zip(together, alone, strict=True):
+        assert query_bytes(query) == query_bytes(first)
+        assert truth == its_truth

@@ -209,6 +209,11 @@ def _paint_part(canvas: Canvas, buildings: Buildings, edge_m: Field) -> None:
     canvas.height_m[rows, cols] = height_m
 
 
+def _luck(buildings: Buildings, cells: _Cells, seed: int) -> Numbers:
+    """Return for each cell what is drawn once for its building."""
+    return draw(seed, buildings.shapes.key)[cells.owner]
+
+
 def _heights(buildings: Buildings, cells: _Cells) -> Numbers:
     """Return the height of each roof cell: a gable falls from its ridge, a hip rises from its outline."""
     own, form = cells.owner, buildings.form[cells.owner]
@@ -216,7 +221,7 @@ def _heights(buildings: Buildings, cells: _Cells) -> Numbers:
     inward = np.where(form == HIP, np.minimum(cells.edge_m, half), np.clip(half - np.abs(cells.v_m), 0, None))
     height_m = buildings.eave_m[own] + buildings.pitch[own] * inward
     parapet = (form == FLAT) & (cells.edge_m < 0.45) & (buildings.half_m[own, 1] > 3)
-    has = draw(17, cells.key) < 0.75
+    has = _luck(buildings, cells, 17) < 0.75
     return np.asarray(height_m + np.where(parapet & has, 0.12 * np.minimum(buildings.eave_m[own], 5.0), 0.0))
 
 
@@ -252,7 +257,7 @@ def _weather(canvas: Canvas, buildings: Buildings, cells: _Cells) -> Numbers:
     is_tile = (cover == COVERS.index("tiles")) | (cover == COVERS.index("slates"))
     pattern = np.where(is_sheet, 0.045 * strip, np.where(is_tile, 0.03 * course + 0.03 * lumps, 0.025 * lumps))
     stained = (
-        (0.08 + 0.1 * draw(29, cells.key)) * patches
+        (0.08 + 0.1 * _luck(buildings, cells, 29)) * patches
         + 0.05 * fine
         + 0.045 * grain(canvas.grid, 1 + canvas.plan.salt)[at]
     )
@@ -269,44 +274,53 @@ def _aged(canvas: Canvas, buildings: Buildings, cells: _Cells, colour: Numbers) 
     share = np.where(whole < rust * 0.7, 0.75 + 0.25 * streaks, np.clip(streaks * 1.6 + 2.2 * rust - 1.5, 0, 0.8))
     share = np.where(cover == COVERS.index("sheets"), np.clip(share, 0, 1) * (rust > 0), 0.0)
     colour = colour + share[:, None] * (_RUST - colour)
-    moss = np.where(cover == COVERS.index("tiles"), np.clip(streaks + 0.8 * draw(31, cells.key) - 0.5, 0, 0.45), 0.0)
+    moss = np.where(
+        cover == COVERS.index("tiles"), np.clip(streaks + 0.8 * _luck(buildings, cells, 31) - 0.5, 0, 0.45), 0.0
+    )
     return np.asarray(colour + moss[:, None] * (_MOSS - colour))
 
 
 def _add_panels(canvas: Canvas, buildings: Buildings, cells: _Cells, colour: Numbers) -> None:
     """Lay solar panels and roof windows on one side of some roofs."""
     half = buildings.half_m[cells.owner]
-    has = (draw(41, cells.key) < 0.14 / canvas.plan.palette.unevenness) & (cells.edge_m > 0.9)
-    start = -half[:, 0] * (0.2 + 0.6 * draw(43, cells.key))
-    end = start + half[:, 0] * (0.5 + draw(47, cells.key))
+    has = (_luck(buildings, cells, 41) < 0.14 / canvas.plan.palette.unevenness) & (cells.edge_m > 0.9)
+    start = -half[:, 0] * (0.2 + 0.6 * _luck(buildings, cells, 43))
+    end = start + half[:, 0] * (0.5 + _luck(buildings, cells, 47))
     inside = (cells.u_m > start) & (cells.u_m < end) & (cells.v_m > 0.12 * half[:, 1]) & (cells.v_m < 0.72 * half[:, 1])
     seam = (np.mod(cells.u_m, 1.05) < 0.22) | (np.mod(cells.v_m, 1.7) < 0.2)
     colour[has & inside] = _PANEL
     colour[has & inside & seam] = _PANEL * 1.7
-    lot_u, lot_v = np.floor(cells.u_m / 3.1).astype(np.int64), np.floor(cells.v_m / 2.6).astype(np.int64)
-    is_window = (draw(53, cells.key) < 0.4) & (draw(59, cells.key, lot_u, lot_v) < 0.22) & (cells.edge_m > 1)
+    is_window = (_luck(buildings, cells, 53) < 0.4) & (cells.edge_m > 1)
     is_window &= (np.mod(cells.u_m, 3.1) < 0.9) & (np.mod(cells.v_m, 2.6) < 1.2) & ~(has & inside)
+    lots = (
+        np.floor(part[is_window] / size_m).astype(np.int64) for part, size_m in ((cells.u_m, 3.1), (cells.v_m, 2.6))
+    )
+    is_window[is_window] = draw(59, cells.key[is_window], *lots) < 0.22
     colour[is_window] = (62, 70, 80)
 
 
-def _lots(cells: _Cells, size_m: float, seed: int) -> tuple[Mask, Numbers]:
-    lots = np.floor(cells.u_m / size_m).astype(np.int64), np.floor(cells.v_m / size_m).astype(np.int64)
-    middle = [0.5 + 0.35 * (draw(seed + part, cells.key, *lots) - 0.5) for part in (1, 2)]
-    half = [0.1 + 0.2 * draw(seed + part, cells.key, *lots) for part in (3, 4)]
-    off_u = np.abs(np.mod(cells.u_m / size_m, 1) - middle[0])
-    off_v = np.abs(np.mod(cells.v_m / size_m, 1) - middle[1])
-    return (off_u < half[0]) & (off_v < half[1]), draw(seed, cells.key, *lots)
+def _lots(cells: _Cells, size_m: float, seed: int, among: Mask) -> tuple[Mask, Numbers]:
+    """Return which cells lie in the middle of their lot, and the luck of this; of all but some cells, none and 0."""
+    u_m, v_m, key = cells.u_m[among], cells.v_m[among], cells.key[among]
+    lots = np.floor(u_m / size_m).astype(np.int64), np.floor(v_m / size_m).astype(np.int64)
+    middle = [0.5 + 0.35 * (draw(seed + part, key, *lots) - 0.5) for part in (1, 2)]
+    half = [0.1 + 0.2 * draw(seed + part, key, *lots) for part in (3, 4)]
+    off_u = np.abs(np.mod(u_m / size_m, 1) - middle[0])
+    off_v = np.abs(np.mod(v_m / size_m, 1) - middle[1])
+    inside, luck = np.zeros(len(among), dtype=bool), np.zeros(len(among))
+    inside[among], luck[among] = (off_u < half[0]) & (off_v < half[1]), draw(seed, key, *lots)
+    return inside, luck
 
 
 def _add_plant(buildings: Buildings, cells: _Cells, colour: Numbers) -> Numbers:
     """Put machines, skylights and stairheads on flat roofs; return how much higher each cell becomes."""
     is_flat = (buildings.form[cells.owner] == FLAT) & (cells.edge_m > 1.2) & (buildings.half_m[cells.owner, 1] > 3.5)
-    inside, luck = _lots(cells, 6.5, 71)
-    chosen = is_flat & inside & (luck < 0.35 * draw(73, cells.key))
-    tone = 95 + 140 * draw(79, cells.key, np.floor(cells.u_m / 6.5).astype(np.int64))
-    colour[chosen] = tone[chosen, None]
-    stairs, luck = _lots(cells, 13.0, 83)
-    stairs &= is_flat & (luck < 0.3) & (buildings.eave_m[cells.owner] > 5)
+    inside, luck = _lots(cells, 6.5, 71, is_flat)
+    chosen = inside & (luck < 0.35 * _luck(buildings, cells, 73))
+    tone = 95 + 140 * draw(79, cells.key[chosen], np.floor(cells.u_m[chosen] / 6.5).astype(np.int64))
+    colour[chosen] = tone[:, None]
+    stairs, luck = _lots(cells, 13.0, 83, is_flat)
+    stairs &= (luck < 0.3) & (buildings.eave_m[cells.owner] > 5)
     colour[stairs] = buildings.wall[cells.owner[stairs]] * 0.95
     stands = np.minimum(buildings.eave_m[cells.owner], 3.0) / 3.0
     return np.asarray(np.where(stairs, 2.4, np.where(chosen, 0.4 + luck * 2.5, 0.0)) * stands)
@@ -315,8 +329,13 @@ def _add_plant(buildings: Buildings, cells: _Cells, colour: Numbers) -> Numbers:
 def _add_chimneys(canvas: Canvas, buildings: Buildings, cells: _Cells, colour: Numbers) -> Numbers:
     """Put a chimney beside the ridge of most pitched roofs; return how much higher each cell becomes."""
     half = buildings.half_m[cells.owner]
-    at_u, at_v = half[:, 0] * (1.2 * draw(89, cells.key) - 0.6), half[:, 1] * (0.5 * draw(97, cells.key) - 0.25)
-    has = (draw(101, cells.key) < 0.8 / canvas.plan.palette.unevenness**2) & (buildings.form[cells.owner] != FLAT)
+    at_u, at_v = (
+        half[:, 0] * (1.2 * _luck(buildings, cells, 89) - 0.6),
+        half[:, 1] * (0.5 * _luck(buildings, cells, 97) - 0.25),
+    )
+    has = (_luck(buildings, cells, 101) < 0.8 / canvas.plan.palette.unevenness**2) & (
+        buildings.form[cells.owner] != FLAT
+    )
     has &= (half[:, 1] > 2.5) & (np.abs(cells.u_m - at_u) < 0.4) & (np.abs(cells.v_m - at_v) < 0.35)
     colour[has] = buildings.wall[cells.owner[has]] * 0.7
     return np.where(has & (buildings.eave_m[cells.owner] > 0.5), 1.1, 0.0)

@@ -108,11 +108,13 @@ def _plots(canvas: Canvas, grid: Grid) -> _Plots:
     across, down = east * np.cos(turn) + north * np.sin(turn), north * np.cos(turn) - east * np.sin(turn)
     luck, use = _drawn_by_plot((np.floor(across / 34), np.floor(down / 52)), (seed + 2, seed + 3))
     is_tilled = use < 0.22 * palette.patchwork
-    row_m = np.where(luck < 0.5, across, down) * 2 * np.pi / (1.2 + 0.8 * luck)
+    tilled, at = np.zeros(grid.shape, dtype=np.float32), np.nonzero(is_tilled)
+    row_m = np.where(luck[at] < 0.5, across[at], down[at]) * 2 * np.pi / (1.2 + 0.8 * luck[at])
+    tilled[at] = 0.45 + 0.25 * np.sin(row_m)
     return _Plots(
         tone=1 + 0.28 * palette.patchwork * (luck - 0.5),
         is_tilled=is_tilled,
-        tilled=np.where(is_tilled, 0.45 + 0.25 * np.sin(row_m), 0).astype(np.float32),
+        tilled=tilled,
         soil=np.array(palette.soil[int(turn * 10) % 2], dtype=np.float32),
     )
 
@@ -180,19 +182,20 @@ def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], so
     canvas.tint(kind == 1, lawn, 0.75)
     canvas.tint(kind == 2, palette.soil[1], np.asarray(0.35 + 0.6 * near, dtype=np.float32))
     canvas.tint(kind == 3, palette.paving, np.asarray(0.6 + 0.35 * near, dtype=np.float32))
-    rows = np.sin(2 * np.pi * _stripe_m(canvas, yard) / 1.7) > 0.1
     beds = (kind == 4) & (noise(grid, 11.0, seed + 5) > -0.1)
-    canvas.tint(beds & rows, np.array(fresh) * 0.85, 0.75)
+    rows = np.zeros(grid.shape, dtype=bool)
+    rows[beds] = np.sin(2 * np.pi * _stripe_m(canvas, yard, beds) / 1.7) > 0.1
+    canvas.tint(rows, np.array(fresh) * 0.85, 0.75)
     canvas.tint(beds & ~rows, palette.soil[0], np.asarray(0.4 + 0.3 * soil, dtype=np.float32))
 
 
-def _stripe_m(canvas: Canvas, numbers: Cells) -> Field:
-    """Return the distance across rows whose direction belongs to each number, metres, shape (rows, cols)."""
-    grid = canvas.grid
+def _stripe_m(canvas: Canvas, numbers: Cells, chosen: Mask) -> Field:
+    """Return the distance across rows whose direction belongs to each number, metres, of the N chosen cells."""
+    row, col = np.nonzero(chosen)
     turn = np.pi * draw(canvas.plan.seed("rows"), np.arange(int(numbers.max(initial=0)) + 1))
-    cos, sin = (part.astype(np.float32)[numbers] for part in (np.cos(turn), np.sin(turn)))
-    east, north = ground_m(grid, canvas.plan.corner_m)
-    return np.asarray(cos * east[None, :] - sin * north[:, None], dtype=np.float32)
+    cos, sin = (part.astype(np.float32)[numbers[row, col]] for part in (np.cos(turn), np.sin(turn)))
+    east, north = ground_m(canvas.grid, canvas.plan.corner_m)
+    return np.asarray(cos * east[col] - sin * north[row], dtype=np.float32)
 
 
 def ground_m(grid: Grid, corner_m: tuple[float, float] | None = None) -> tuple[Field, Field]:
@@ -245,7 +248,7 @@ def _paint_green(canvas: Canvas) -> NDArray[np.int8]:
     # By its place in the window, as pictures of published tasks are; another look is painted window by window.
     which = np.concatenate([[0], shapes.key]) if canvas.plan.salt else np.arange(len(kinds))
     mown = (found == PARK) & (draw(3, which) < 0.4)[numbers]
-    stripes = np.sign(np.sin(np.pi * _stripe_m(canvas, numbers) / 2.4)) * 0.035
+    stripes = np.sign(np.sin(np.pi * _stripe_m(canvas, numbers, mown) / 2.4)) * 0.035
     canvas.shade(mown, np.asarray(1 + stripes, dtype=np.float32))
     floor = np.array(canvas.plan.palette.soil[0]) * 0.55 + fresh * 0.2
     canvas.tint(found == WOOD, floor, 0.75)
@@ -268,20 +271,23 @@ def _paint_fields(canvas: Canvas) -> Mask:
     colour = colour * (1 + 0.07 * bell(plan.seed("field"), shapes.key))[:, None]
     colour = np.vstack([np.zeros((1, 3)), colour])
     cells = numbers > 0
+    if not cells.any():
+        return cells
+    own = numbers[cells]
     canvas.tint(
         cells,
-        colour[numbers[cells]],
+        colour[own],
         np.asarray(0.82 + 0.12 * noise(canvas.grid, 12.0, 5 + plan.salt), dtype=np.float32),
     )
     # Distance across the rows of each field, which run along its longer side, metres
-    axis = np.vstack([[1.0, 0.0], rectangles(shapes.geometry)[1]]).astype(np.float32)[numbers]
-    east, north = ground_m(canvas.grid, canvas.plan.corner_m)
-    across = np.asarray(axis[..., 0] * north[:, None] - axis[..., 1] * east[None, :], dtype=np.float32)
-    pitch = np.concatenate([[1.0], 0.75 + 1.6 * luck])[numbers]
-    wander = 0.5 * noise(canvas.grid, 25.0, plan.seed("wander"))
+    axis = np.vstack([[1.0, 0.0], rectangles(shapes.geometry)[1]]).astype(np.float32)[own]
+    (east, north), (row, col) = ground_m(canvas.grid, canvas.plan.corner_m), np.nonzero(cells)
+    across = axis[:, 0] * north[row] - axis[:, 1] * east[col]
+    pitch = np.concatenate([[1.0], 0.75 + 1.6 * luck])[own]
+    wander = 0.5 * noise(canvas.grid, 25.0, plan.seed("wander"))[cells]
     rows = 0.06 * np.sin(2 * np.pi * (across + wander) / pitch)
     tracks = np.where(np.mod(across + wander, 18.0) < 0.7, -0.13, 0.0)
-    patches = 0.12 * fractal(canvas.grid, 40.0, plan.seed("growth"), octaves=4)
+    patches = 0.12 * fractal(canvas.grid, 40.0, plan.seed("growth"), octaves=4)[cells]
     canvas.shade(cells, np.asarray(1 + rows + tracks + patches, dtype=np.float32))
     is_orchard = np.concatenate([[False], (luck * 131 % 1 < 0.16) & (shapely.area(shapes.geometry) < 4e4)])
     return np.asarray(is_orchard[numbers])
@@ -293,13 +299,15 @@ def _paint_bare(canvas: Canvas) -> None:
     if not len(shapes):
         return
     numbers, seed = burn_numbers(shapes.areas(), canvas.grid), plan.seed("rubble")
+    cells = numbers > 0
+    if not cells.any():
+        return
     is_rock = plan.chance("bare", shapes.key) < 0.6
     rock, sand = (np.array(colour) for colour in plan.palette.bare)
     colour = np.where(is_rock[:, None], rock, sand) * (1 + 0.06 * bell(seed, shapes.key))[:, None]
-    cells = numbers > 0
     canvas.tint(cells, np.vstack([np.zeros((1, 3)), colour])[numbers[cells]], 0.93)
-    rough = np.concatenate([[0.0], np.where(is_rock, 0.2, 0.05)]).astype(np.float32)[numbers]
-    rubble = fractal(canvas.grid, 3.0, seed + 1) + fractal(canvas.grid, 14.0, seed + 2)
+    rough = np.concatenate([[0.0], np.where(is_rock, 0.2, 0.05)]).astype(np.float32)[numbers[cells]]
+    rubble = (fractal(canvas.grid, 3.0, seed + 1) + fractal(canvas.grid, 14.0, seed + 2))[cells]
     canvas.shade(cells, np.asarray(1 + rough * rubble, dtype=np.float32))
 
 

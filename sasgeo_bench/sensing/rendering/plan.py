@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands where in one window of a region: shapes by class, each with a seed of its own, before any paint."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
@@ -149,11 +149,13 @@ class Canvas:
             used += len(at)
 
     def shade(self, cells: Mask, factor: Field) -> None:
-        """Multiply the colour of the chosen cells by a raster."""
+        """Multiply the colour of the chosen cells, one factor for each of them."""
+        used = 0
         for strip, _ in self.strips():
             at = np.flatnonzero(cells[strip])
             here = self.colour[strip].reshape(-1, 3)
-            here[at] = np.clip(here[at] * factor[strip].ravel()[at][:, None].astype(np.float32), 0, 255)
+            here[at] = np.clip(here[at] * factor[used : used + len(at), None], 0, 255)
+            used += len(at)
 
 
 def no_shapes() -> Shapes:
@@ -196,12 +198,23 @@ def shapes_of(features: "gpd.GeoDataFrame", box: shapely.Geometry, *, salt: int 
 
 def burn_numbers(geometry: NDArray[np.object_], grid: Grid) -> Cells:
     """Return the number from 1 on of the last area that covers each cell's centre, shape (rows, cols); else 0."""
-    kept = np.flatnonzero(~(shapely.is_empty(geometry) | shapely.is_missing(geometry)))
+    west, south, east, north = grid.bounds_m
+    bounds = shapely.bounds(geometry).reshape(-1, 4)
+    is_near = (bounds[:, 0] < east) & (bounds[:, 2] > west) & (bounds[:, 1] < north) & (bounds[:, 3] > south)
+    kept = np.flatnonzero(is_near)  # bounds of what is empty or missing are NaN
     if not len(kept):
         return np.zeros(grid.shape, dtype=np.int32)
-    pairs = [(geometry[number], int(number) + 1) for number in kept]
+    pairs = [(_as_geojson(geometry[number]), int(number) + 1) for number in kept]
     burnt = rasterio.features.rasterize(pairs, grid.shape, transform=Affine(*grid.transform), fill=0, dtype=np.int32)
     return np.asarray(burnt, dtype=np.int32)
+
+
+def _as_geojson(geometry: shapely.Geometry) -> Mapping[str, object]:
+    """Return what `geometry.__geo_interface__` does, which takes ten times as long for a polygon."""
+    if shapely.get_type_id(geometry) != shapely.GeometryType.POLYGON:
+        return dict(geometry.__geo_interface__)
+    rings = shapely.get_rings(geometry)
+    return {"type": "Polygon", "coordinates": [shapely.get_coordinates(ring).tolist() for ring in rings]}
 
 
 def inside_m(mask: Mask, grid: Grid) -> Field:
@@ -306,8 +319,9 @@ class HeightPyramid:
 
     def highest_within(self, col: Field, row: Field, radius: Field) -> Field:
         """Return at least the highest cell within a radius (cells) of each point; far outside, that of the edge."""
-        # The exponent of a number x in [1, inf) is the least n with x < 2 ** n.
-        level = np.minimum(np.frexp(np.maximum(radius, 1))[1], len(self._rows) - 1)
+        # The exponent of a float32 x in [1, inf), counted as `frexp` does, is the least n with x < 2 ** n.
+        exponent = (np.maximum(radius, np.float32(1)).view(np.int32) >> 23) - 126
+        level = np.minimum(exponent, len(self._rows) - 1)
         rows, cols = self._rows[level], self._cols[level]
         at_row = np.minimum(np.maximum(row, 0).astype(np.int32) >> level, rows - 1)
         at_col = np.minimum(np.maximum(col, 0).astype(np.int32) >> level, cols - 1)
@@ -458,18 +472,21 @@ def _follow(hits: Hits, raster: Field, pixel: NDArray[np.int64], top: Field) -> 
     scratch = _Scratch(len(pixel))
     while len(pixel):
         z_m, found = scratch.look(raster, rays)
-        met = found >= z_m
-        has_met = np.logical_or.reduce(met, axis=0)
-        chosen = np.flatnonzero(has_met)
-        step, ended = met[:, chosen].argmax(axis=0), rays.take(chosen, axis=1)
-        here_m = np.maximum(z_m[step, chosen], 0)  # the ground plane, where the last step went below it
+        above = found < z_m
+        for step in range(1, _AT_ONCE):  # `logical_and.accumulate` takes each cell by itself
+            above[step] &= above[step - 1]
+        chosen, left = np.flatnonzero(~above[-1]), np.flatnonzero(above[-1])
+        ended = rays.take(chosen, axis=1)
+        # The first step that met something, of each ray that did
+        cell = np.add.reduce(above[:-1].view(np.uint8), axis=0, dtype=np.uint8).take(chosen) * np.int64(len(pixel))
+        cell += chosen
+        here_m = np.maximum(z_m.ravel().take(cell), 0)  # the ground plane, where the last step went below it
         at = pixel[chosen]
         hits.col.ravel()[at] = ended[0] - ended[2] * here_m
         hits.row.ravel()[at] = ended[1] - ended[3] * here_m
         hits.z_m.ravel()[at] = here_m
         # 0.6 m: higher above the point that a ray meets, a cell shows its flank there
-        hits.is_side.ravel()[at] = found[step, chosen] - here_m > ended[5] + np.float32(0.6)
-        left = np.flatnonzero(~has_met)
+        hits.is_side.ravel()[at] = found.ravel().take(cell) - here_m > ended[5] + np.float32(0.6)
         pixel, rays = pixel[left], rays.take(left, axis=1)
         rays[4] -= _AT_ONCE * rays[5]
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Paint roads, paths, railways, bridges, car parks, fences and walls, and place the street lamps."""
 
+from dataclasses import dataclass
 from typing import Final
 
 import cv2
@@ -38,12 +39,14 @@ _LAMP_SPACING_M: Final = 34.0
 
 def paint_roads(canvas: Canvas) -> None:
     """Paint everything that is driven or walked on, lowest level first."""
-    _paint_parking(canvas)
-    _paint_tracks(canvas)
+    surfaces: _Surfaces = {}
+    _paint_parking(canvas, surfaces)
+    _paint_tracks(canvas, surfaces)
     for level_is_low in (True, False):
         for name in STREETS:
             shapes = canvas.plan.of(name)
-            _paint_streets(canvas, shapes.part((shapes.level <= 0) == level_is_low), is_major=name == "road_major")
+            own = shapes.part((shapes.level <= 0) == level_is_low)
+            _paint_streets(canvas, own, surfaces, is_major=name == "road_major")
         if level_is_low:
             _paint_rails(canvas)
     _paint_parapets(canvas)
@@ -60,7 +63,7 @@ def _soft(mask: Mask, canvas: Canvas, ragged: float, purpose: str) -> Field:
     return soft
 
 
-def _paint_streets(canvas: Canvas, shapes: Shapes, *, is_major: bool) -> None:
+def _paint_streets(canvas: Canvas, shapes: Shapes, surfaces: "_Surfaces", *, is_major: bool) -> None:
     """Paint carriageways: asphalt or earth for each road, patches, wheel tracks, verges and markings."""
     if not len(shapes):
         return
@@ -83,7 +86,7 @@ def _paint_streets(canvas: Canvas, shapes: Shapes, *, is_major: bool) -> None:
     cover = _soft(mask, canvas, 0.35 if is_major else 0.3 + 0.5 * (1 - palette.paved_share), "edges")
     _tint_each(canvas, numbers, colour, cover)
     canvas.kind[mask] = ROAD
-    _wear(canvas, mask, np.concatenate([[True], is_paved])[numbers])
+    _wear(canvas, mask, np.concatenate([[True], is_paved])[numbers], surfaces)
     # 5.8 m: narrower roads have no line in the middle
     lined = is_paved & (shapes.width_m >= 5.8) & (plan.chance("lines", shapes.key) < palette.markings)
     _paint_markings(canvas, shapes.part(lined))
@@ -97,27 +100,60 @@ def _tint_each(canvas: Canvas, numbers: Cells, colours: Numbers, cover: Field) -
         part.tint(reach, colours[number], cover[strip])
 
 
-def _wear(canvas: Canvas, mask: Mask, is_paved: Mask) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surface:
+    """How uneven a strip of ground is, where a road runs over it: the same for all roads."""
+
+    stains: Field
+    is_patch: Mask
+    is_crack: Mask
+    grassy: Field
+
+    @classmethod
+    def of(cls, canvas: Canvas) -> "_Surface":
+        grid, seed = canvas.grid, canvas.plan.seed("wear")
+        return cls(
+            stains=0.06 * fractal(grid, 9.0, seed)
+            + 0.045 * grain(grid, 1 + canvas.plan.salt)
+            + 0.045 * noise(grid, 1.0, seed + 4),
+            is_patch=noise(grid, 5.0, seed + 5) > 0.72,
+            is_crack=np.abs(noise(grid, 6.0, seed + 6)) < 0.018,
+            grassy=np.clip(0.5 + noise(grid, 4.0, seed + 7), 0, 1),
+        )
+
+
+_Surfaces = dict[int, _Surface]  # by the first row of the strip
+_KEPT_CELLS: Final = 4_000_000  # of a canvas whose surfaces are kept, ten bytes each
+
+
+def _wear(canvas: Canvas, mask: Mask, is_paved: Mask, surfaces: _Surfaces) -> None:
     """Make a road uneven: long stains, repaired patches, cracks, wheel tracks, grass in the middle of earth roads."""
     edge_m = inside_m(mask, canvas.grid)
     for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
         if mask[strip].any():
-            _wear_part(part, mask[strip], is_paved[strip], edge_m[strip])
+            surface = surfaces.get(strip.start) or _Surface.of(part)
+            if mask.size <= _KEPT_CELLS:
+                surfaces[strip.start] = surface
+            _wear_part(part, mask[strip] & is_paved[strip], edge_m[strip], surface)
+            _wear_earth(part, mask[strip] & ~is_paved[strip], edge_m[strip], surface)
 
 
-def _wear_part(canvas: Canvas, mask: Mask, is_paved: Mask, edge_m: Field) -> None:
-    grid, seed, rough = canvas.grid, canvas.plan.seed("wear"), canvas.plan.palette.unevenness
-    stains = (
-        0.06 * fractal(grid, 9.0, seed) + 0.045 * grain(grid, 1 + canvas.plan.salt) + 0.045 * noise(grid, 1.0, seed + 4)
-    )
-    patches = np.where(noise(grid, 5.0, seed + 5) > 0.72, -0.09, 0.0)
-    cracks = np.where(np.abs(noise(grid, 6.0, seed + 6)) < 0.018, -0.12, 0.0)
-    wheels = 0.035 * np.cos(2 * np.pi * edge_m / 1.75)
-    canvas.shade(mask & is_paved, np.asarray(1 + rough * (stains + patches + cracks) + wheels, dtype=np.float32))
-    earth = mask & ~is_paved
-    canvas.shade(earth, np.asarray(1 + rough * 1.6 * stains + 1.5 * wheels, dtype=np.float32))
-    middle = np.clip((edge_m - 1.1) * 2, 0, 1) * np.clip(0.5 + noise(grid, 4.0, seed + 7), 0, 1) * 0.5
+def _wear_part(canvas: Canvas, paved: Mask, edge_m: Field, surface: _Surface) -> None:
+    rough, patches = canvas.plan.palette.unevenness, np.where(surface.is_patch[paved], -0.09, 0.0)
+    cracks = np.where(surface.is_crack[paved], -0.12, 0.0)
+    uneven = 1 + rough * (surface.stains[paved] + patches + cracks)
+    canvas.shade(paved, np.asarray(uneven + _wheels(edge_m[paved]), dtype=np.float32))
+
+
+def _wear_earth(canvas: Canvas, earth: Mask, edge_m: Field, surface: _Surface) -> None:
+    stains, wheels = canvas.plan.palette.unevenness * 1.6 * surface.stains[earth], _wheels(edge_m[earth])
+    canvas.shade(earth, np.asarray(1 + stains + 1.5 * wheels, dtype=np.float32))
+    middle = np.clip((edge_m - 1.1) * 2, 0, 1) * surface.grassy * 0.5
     canvas.tint(earth & (middle > 0.02), canvas.plan.palette.grass[1], np.asarray(middle, dtype=np.float32))
+
+
+def _wheels(edge_m: Field) -> Field:
+    return np.asarray(0.035 * np.cos(2 * np.pi * edge_m / 1.75))
 
 
 def _paint_markings(canvas: Canvas, shapes: Shapes) -> None:
@@ -127,8 +163,9 @@ def _paint_markings(canvas: Canvas, shapes: Shapes) -> None:
         dashes = along(line, 9.0, 2.0)
         fill_boxes(drawn, _boxes(dashes, 1.6, 0.075), canvas.grid, np.full(len(dashes), 210))
         if width_m >= 7.5:
+            middle = along(line, 2.0)
             for side in (-1, 1):
-                edge = along(line, 2.0)
+                edge = middle.copy()
                 edge[:, :2] += side * (width_m / 2 - 0.35) * np.stack([-edge[:, 3], edge[:, 2]], axis=1)
                 fill_boxes(drawn, _boxes(edge, 1.05, 0.06), canvas.grid, np.full(len(edge), 190))
     worn = np.clip(0.85 + 0.6 * noise(canvas.grid, 5.0, canvas.plan.seed("paint")), 0.15, 1)
@@ -141,7 +178,7 @@ def _boxes(at: Numbers, half_long_m: float, half_wide_m: float) -> Numbers:
     return np.column_stack([at, np.full(len(at), half_long_m), np.full(len(at), half_wide_m)])
 
 
-def _paint_tracks(canvas: Canvas) -> None:
+def _paint_tracks(canvas: Canvas, surfaces: "_Surfaces") -> None:
     """Paint paths and tracks: earth, gravel or paving by feature, ragged, with grass between the wheels of tracks."""
     shapes, plan = canvas.plan.of("path_track"), canvas.plan
     if not len(shapes):
@@ -153,7 +190,7 @@ def _paint_tracks(canvas: Canvas) -> None:
     colour = np.vstack([colour[:1], colour * (1 + 0.08 * bell(plan.seed("tone"), shapes.key))[:, None]])
     faint = np.clip(0.8 + 0.35 * noise(canvas.grid, 14.0, plan.seed("faint")), 0.35, 1)
     _tint_each(canvas, numbers, colour, np.asarray(cover * faint, dtype=np.float32))
-    _wear(canvas, numbers > 0, np.zeros(canvas.grid.shape, dtype=bool))
+    _wear(canvas, numbers > 0, np.zeros(canvas.grid.shape, dtype=bool), surfaces)
     canvas.kind[numbers > 0] = ROAD
 
 
@@ -166,7 +203,7 @@ def _paint_rails(canvas: Canvas) -> None:
         canvas.grid, 3.0, canvas.plan.seed("ballast")
     )
     canvas.tint(bed, _BALLAST, _soft(bed, canvas, 0.5, "ballast"))
-    canvas.shade(bed, np.asarray(1 + stones, dtype=np.float32))
+    canvas.shade(bed, np.asarray(1 + stones, dtype=np.float32)[bed])
     canvas.kind[bed] = ROAD
     for line in shapes.geometry:
         sleepers = along(line, 0.65)
@@ -177,7 +214,7 @@ def _paint_rails(canvas: Canvas) -> None:
             fill_boxes(canvas.colour, _boxes(rail, 0.55, 0.05), canvas.grid, np.tile([150, 146, 142], (len(rail), 1)))
 
 
-def _paint_parking(canvas: Canvas) -> None:
+def _paint_parking(canvas: Canvas, surfaces: "_Surfaces") -> None:
     """Paint car parks: one surface each, oil and seams; the bays are drawn with the cars."""
     shapes, plan = canvas.plan.of("parking"), canvas.plan
     if not len(shapes):
@@ -188,7 +225,7 @@ def _paint_parking(canvas: Canvas) -> None:
     tone = (1 + 0.12 * bell(plan.seed("asphalt"), shapes.key))[:, None]
     colour = np.where(is_paved[:, None], np.array(plan.palette.asphalt) * tone, np.array(plan.palette.soil[1]) * tone)
     canvas.tint(mask, np.vstack([colour[:1], colour])[numbers[mask]], 0.95)
-    _wear(canvas, mask, np.concatenate([[True], is_paved])[numbers])
+    _wear(canvas, mask, np.concatenate([[True], is_paved])[numbers], surfaces)
     canvas.kind[mask] = ROAD
 
 
@@ -243,17 +280,18 @@ def _lamps(canvas: Canvas) -> Picture:
 
 def street_points(canvas: Canvas, spacing_m: float, beside_m: float, names: tuple[str, ...]) -> NDArray[np.float64]:
     """Return points along both sides of streets: easting, northing, cos, sin, draw; shape (N, 5)."""
-    found = [np.zeros((0, 5))]
+    found, seed = [np.zeros((0, 5))], canvas.plan.seed(f"street{spacing_m}")
     for name in names:
         shapes = canvas.plan.of(name)
         lines = zip(shapes.geometry, shapes.width_m, shapes.key, strict=True)
         for line, width_m, key in lines:
             if not np.isfinite(width_m):
                 continue
+            middle = along(line, spacing_m, spacing_m / 2)
             for side in (-1, 1):
-                at = along(line, spacing_m, spacing_m / 2)
+                at = middle.copy()
                 at[:, :2] += side * (width_m / 2 + beside_m) * np.stack([-at[:, 3], at[:, 2]], axis=1)
-                luck = draw(canvas.plan.seed(f"street{spacing_m}"), np.full(len(at), key), np.arange(len(at)) * side)
+                luck = draw(seed, np.full(len(at), key), np.arange(len(at)) * side)
                 found.append(np.column_stack([at, luck]))
     return np.concatenate(found)
 

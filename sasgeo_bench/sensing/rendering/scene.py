@@ -244,12 +244,15 @@ def _paint_greenery(canvas: Canvas, cover: Cover) -> None:
         return points[points[:, 3] < share * away * room[at]]
 
     wood = sown("wood", lambda green, *_: np.where(green == WOOD, 0.95, 0.0))
-    paint_trees(canvas, make_trees(canvas, wood, size=(2.0, 4.4), is_wood=True))
     single = sown("single", lambda *about: _single_trees(*about, dense=dense))
-    paint_trees(canvas, make_trees(canvas, single, size=(1.6, 4.6)))
     bushes = sown("bush", lambda *about: _bushes(*about, dense=dense))
-    paint_trees(canvas, make_trees(canvas, bushes, size=(0.6, 1.3)))
-    paint_trees(canvas, hedge_trees(canvas))
+    groups = (
+        make_trees(canvas, wood, size=(2.0, 4.4), is_wood=True),
+        make_trees(canvas, single, size=(1.6, 4.6)),
+        make_trees(canvas, bushes, size=(0.6, 1.3)),
+        hedge_trees(canvas),
+    )
+    paint_trees(canvas, groups)
 
 
 def _single_trees(

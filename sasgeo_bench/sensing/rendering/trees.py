@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trees and hedges: where crowns stand, and how they are painted: domes, cones, palms, bare branches in winter."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -10,13 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.sensing.rendering.plan import CROWN, Canvas, along
+from sasgeo_bench.sensing.rendering.plan import CROWN, Canvas, Mask, along
 from sasgeo_bench.sensing.rendering.seasons import GROWTH
 from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, grain, seed_of
 
 BROAD, CONIFER, PALM, BUSH = range(4)
 _SPACING_M: Final = 3.5
 _RADII_M: Final = (0.6, 0.9, 1.3, 1.8, 2.4, 3.0, 3.7, 4.5, 5.5)
+_SHAPES: Final = 6  # different crowns of one size
+_BARK: Final = (134.0, 122.0, 108.0)
+_HALF, _NO_TREE = np.uint64(32), np.uint64(2**32 - 1)
+_AT_ONCE: Final = 2**18  # cells of crowns, so that they stay in the cache
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,6 +34,10 @@ class Trees:
     form: NDArray[np.int64]
     colour: Numbers
     luck: Numbers
+
+    def part(self, chosen: Mask | NDArray[np.int64]) -> "Trees":
+        """Return the chosen trees."""
+        return Trees(**{name: getattr(self, name)[chosen] for name in Trees.__slots__})
 
 
 def scatter(grid: Grid, seed: int) -> tuple[Numbers, NDArray[np.int64]]:
@@ -117,40 +126,117 @@ def hedge_trees(canvas: Canvas) -> Trees:
     )
 
 
-def paint_trees(canvas: Canvas, trees: Trees) -> None:
-    """Paint crowns; each raises the height where it is the highest thing. Bare ones leave gaps between branches."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Stand:
+    """Trees in the order in which they are painted, with the number of each one's crown, its corner (row, col), side.
+
+    `is_bare` has no leaves, `fits` lies wholly on the canvas.
+    """
+
+    trees: Trees
+    crowns: "Sequence[_Crown]"
+    number: NDArray[np.int64]
+    corner: NDArray[np.int64]
+    side: NDArray[np.int64]
+    is_bare: Mask
+    fits: Mask
+
+    @classmethod
+    def of(cls, canvas: Canvas, groups: Sequence[Trees]) -> "_Stand":
+        trees = _in_turn(groups)
+        number, crowns = _crowns_of(trees, canvas.grid.cell_size_m)
+        side = np.array([len(crown.height) for crown in crowns], dtype=np.int64)[number]
+        corner = canvas.grid.to_cells(trees.at_m).astype(np.int64) - (side // 2)[:, None]
+        return cls(
+            trees=trees,
+            crowns=crowns,
+            number=number,
+            corner=corner,
+            side=side,
+            is_bare=_is_bare(canvas, trees),
+            fits=np.asarray(((corner >= 0) & (corner + side[:, None] <= canvas.grid.shape)).all(axis=1)),
+        )
+
+
+def paint_trees(canvas: Canvas, groups: Sequence[Trees]) -> None:
+    """Paint crowns, one group after the other; each raises the height where it is the highest thing.
+
+    Bare ones leave gaps between branches.
+    """
+    stand = _Stand.of(canvas, groups)
+    highest = _highest(canvas, stand)
+    colour = np.where(stand.is_bare[:, None], _BARK, stand.trees.colour)
+    # The tones of all crowns in one row, and where those of each tree would begin if its crown lay in the corner
+    tones = np.concatenate([np.zeros(0, dtype=np.float32), *(crown.tone.ravel() for crown in stand.crowns)])
+    first = np.cumsum([0, *(crown.tone.size for crown in stand.crowns)])[:-1][stand.number]
+    first -= stand.corner[:, 0] * stand.side + stand.corner[:, 1]
+    for strip, grid in canvas.strips():
+        height_m, owner = highest[strip] >> _HALF, highest[strip].astype(np.uint32)
+        at = np.flatnonzero(owner != _NO_TREE)
+        tree = (_NO_TREE - 1 - owner.ravel()[at]).astype(np.int64)
+        row, col = np.divmod(at, grid.cols)
+        tone = tones[first[tree] + (row + strip.start) * stand.side[tree] + col]
+        canvas.height_m[strip].reshape(-1)[at] = height_m.ravel()[at].astype(np.uint32).view(np.float32)
+        canvas.kind[strip].reshape(-1)[at] = CROWN
+        canvas.owner[strip].reshape(-1)[at] = 0
+        canvas.colour[strip].reshape(-1, 3)[at] = np.clip(tone[:, None] * colour[tree], 0, 255)
+
+
+def _highest(canvas: Canvas, stand: _Stand) -> NDArray[np.uint64]:
+    """Return for each cell the highest thing: the bits of its height, and in the lower half of the number whose it is.
+
+    A height that is not negative sorts by the bits of its float32. Of equal heights that of what stands there already
+    is seen (`_NO_TREE`), or that of the first tree, whose number counts down. So the order of trees does not matter.
+    """
+    found = (canvas.height_m + np.float32(0)).view(np.uint32).astype(np.uint64) << _HALF | _NO_TREE
+    is_bare, height_m = stand.is_bare, stand.trees.height_m.astype(np.float32)
+    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3 if is_bare.any() else np.ones((1, 1), dtype=bool)
+    for kind, crown in enumerate(stand.crowns):
+        own = np.flatnonzero((stand.number == kind) & stand.fits)
+        row, col = np.nonzero(crown.height)
+        for trees in np.array_split(own, 1 + len(own) * len(row) // _AT_ONCE):
+            cell = (stand.corner[trees] @ (canvas.grid.cols, 1))[:, None] + (row * canvas.grid.cols + col)
+            key = (crown.height[row, col] * height_m[trees, None]).view(np.uint32).astype(np.uint64) << _HALF
+            key |= (_NO_TREE - 1 - trees.astype(np.uint64))[:, None]
+            if is_bare[trees].any():
+                key[is_bare[trees, None] & ~twigs.ravel()[cell]] = 0
+            np.maximum.at(found.ravel(), cell.ravel(), key.ravel())
+    return found
+
+
+def _in_turn(groups: Sequence[Trees]) -> Trees:
+    """Return the trees of all groups in the order in which they are painted: by group, then by height."""
+    order = [trees.part(np.argsort(trees.height_m, kind="stable")) for trees in groups]
+    return Trees(**{name: np.concatenate([getattr(trees, name) for trees in order]) for name in Trees.__slots__})
+
+
+def _is_bare(canvas: Canvas, trees: Trees) -> Mask:
+    """Return which trees have no leaves in this season, shape (N,)."""
     growth = GROWTH[canvas.season]
-    cell_m = canvas.grid.cell_size_m
-    corner = canvas.grid.to_cells(trees.at_m)
-    sizes = np.abs(trees.radius_m[:, None] - np.array(_RADII_M)).argmin(axis=1)
     is_evergreen = (trees.form == CONIFER) | (trees.form == PALM)
-    sleeps = ~is_evergreen & (
-        np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1)
-    )
-    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3
-    order = np.argsort(trees.height_m, kind="stable")
-    for tree in order.tolist():
-        shape = int(trees.luck[tree] * 1e6) % 6  # 6: different crowns of one size
-        dome, tone = _crown(int(trees.form[tree]), int(sizes[tree]), shape, cell_m)
-        half = dome.shape[0] // 2
-        row, col = int(corner[tree, 0]) - half, int(corner[tree, 1]) - half
-        if row < 0 or col < 0 or row + dome.shape[0] > canvas.grid.rows or col + dome.shape[1] > canvas.grid.cols:
-            continue
-        part = np.s_[row : row + dome.shape[0], col : col + dome.shape[1]]
-        crown_m = dome * np.float32(trees.height_m[tree])
-        higher = (crown_m > canvas.height_m[part]) & (dome > 0)
-        if sleeps[tree]:
-            higher &= twigs[part]
-        canvas.height_m[part][higher] = crown_m[higher]
-        canvas.kind[part][higher] = CROWN
-        canvas.owner[part][higher] = 0
-        paint = np.array((134, 122, 108)) if sleeps[tree] else trees.colour[tree]
-        canvas.colour[part][higher] = np.clip(tone[higher][:, None] * paint, 0, 255)
+    share = growth.bare_share * (0.85 if growth.bare_share == 1 else 1)
+    return np.asarray(~is_evergreen & (np.mod(trees.luck * 7.31, 1) < share))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Crown:
+    """Height (share of the tree's) and brightness of a crown on cells, height 0 outside it; shape (2n + 1, 2n + 1)."""
+
+    height: Field
+    tone: Field
+
+
+def _crowns_of(trees: Trees, cell_m: float) -> tuple[NDArray[np.int64], list[_Crown]]:
+    """Return the number of each tree's crown, shape (N,), and those crowns."""
+    size = np.abs(trees.radius_m[:, None] - np.array(_RADII_M)).argmin(axis=1)
+    shape = (trees.luck * 1e6).astype(np.int64) % _SHAPES
+    kinds = (BUSH + 1, len(_RADII_M), _SHAPES)
+    found, number = np.unique(np.ravel_multi_index((trees.form, size, shape), kinds), return_inverse=True)
+    return number, [_crown(*map(int, np.unravel_index(kind, kinds)), cell_m) for kind in found]
 
 
 @lru_cache(maxsize=512)
-def _crown(form: int, size: int, shape: int, cell_m: float) -> tuple[Field, Field]:
-    """Return height (share of the tree's) and brightness of a crown on cells, 0 outside it; shape (2n + 1, 2n + 1)."""
+def _crown(form: int, size: int, shape: int, cell_m: float) -> _Crown:
     radius = _RADII_M[size] / cell_m
     half = int(np.ceil(radius * 1.15)) + 1
     down, right = np.mgrid[-half : half + 1, -half : half + 1].astype(np.float32)
@@ -175,4 +261,4 @@ def _crown(form: int, size: int, shape: int, cell_m: float) -> tuple[Field, Fiel
         )
         dome = np.where(inside, np.clip(rise + 0.055 * lumps, 0.05, 1.05), 0.0)
         tone = 0.84 + 0.2 * bulge + 0.15 * lumps
-    return dome.astype(np.float32), np.asarray(tone, dtype=np.float32)
+    return _Crown(dome.astype(np.float32), np.asarray(tone, dtype=np.float32))

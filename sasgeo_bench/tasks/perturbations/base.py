@@ -35,7 +35,7 @@ def check_ranges(owner: object, **ranges: tuple[float, float]) -> None:
 
 def share_changed(before: Evidence, after: Evidence) -> float:
     """Return the fraction of cells, over all classes, that differ."""
-    return float((before.cells != after.cells).mean())
+    return np.count_nonzero(before.cells != after.cells) / before.cells.size  # which is faster than their mean
 
 
 def share_hidden(before: Evidence, after: Evidence) -> float:

@@ -100,6 +100,12 @@ class FlightSuite(Suite):
         """Perceive one view."""
         return QueryDraft(evidence=shot.perceived())
 
+    def look(self, variant: Variant) -> Variant:
+        """Return a variant whose views show the same from the same poses, the same one for as many as possible."""
+        if type(self).draw is not FlightSuite.draw:  # what a suite draws itself may depend on anything
+            return variant
+        return replace(variant, role="control", kind="control", strength=0.0)
+
     def map_of(self, scene: Scene, variant: Variant, site: int) -> str:  # noqa: ARG002 - all sites are alike
         """Return the name of the map that a variant searches at a site, given by its index."""
         return self.map_region(scene, variant)

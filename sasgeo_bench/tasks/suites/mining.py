@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.graph import LAYERS
-from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
+from sasgeo_bench.tasks.state import BLOCK_M, DRAWN_CLASSES, State
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -23,7 +23,6 @@ SCORERS: Final = ("histogram", "rings", "distance", "graph")
 STRIDE_M: Final = 32.0
 LEAST_RADII: Final = 3.0  # least distance of a decoy from the truth, in half diagonals of the footprint
 
-_COARSE_M: Final = 8.0
 RINGS: Final = 4
 _SECTORS: Final = 12
 _FAR_M: Final = 64.0  # distances are clipped here
@@ -65,10 +64,7 @@ def describe(state: State, *, side_m: float, clear_m: float, like: Windows | Non
     The scorers: fractions of the classes in the disc; fractions in rings; distances to thin classes on a polar grid at
     the best rotation; graph nodes by kind in two rings. None of them is an evaluated method.
     """
-    factor = max(1, round(_COARSE_M / state.grid.cell_size_m))
-    grid = state.grid.coarsen(factor)
-    known = _mean_blocks(state.known, factor)
-    shares = {name: _mean_blocks(state.has(name), factor) for name in state.classes}
+    grid, known, shares = state.blocks.grid, state.blocks.known, state.blocks.shares
     radius = side_m / 2 / grid.cell_size_m
     kernels = _rings(radius, RINGS)
     step = max(1, round(STRIDE_M / grid.cell_size_m))
@@ -104,16 +100,6 @@ def describe(state: State, *, side_m: float, clear_m: float, like: Windows | Non
     )
 
 
-def _mean_blocks(mask: NDArray[np.bool_], factor: int) -> Floats:
-    """Return the fraction of a mask in square blocks; the last blocks are padded with False."""
-    rows, cols = -(-mask.shape[0] // factor), -(-mask.shape[1] // factor)
-    padded = np.zeros((rows * factor, cols * factor), dtype=np.uint8)
-    padded[: mask.shape[0], : mask.shape[1]] = mask
-    return np.asarray(
-        cv2.resize(padded * np.uint8(255), (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.float32
-    ) / np.float32(255)
-
-
 def _rings(radius: float, count: int) -> list[Floats]:
     """Return kernels of equal area that tile a disc, each with sum 1."""
     reach = int(np.ceil(radius))
@@ -143,7 +129,7 @@ def _polar(shares: dict[str, Floats], cells: NDArray[np.int64], radius: float) -
         if name not in shares:
             continue
         distance = cv2.distanceTransform((shares[name] <= 0).astype(np.uint8), cv2.DIST_L2, 3)
-        near = np.minimum(distance, _FAR_M / _COARSE_M) * (_COARSE_M / _FAR_M)
+        near = np.minimum(distance, _FAR_M / BLOCK_M) * (BLOCK_M / _FAR_M)
         rows = np.clip(cells[:, 0, None, None] + down, 0, near.shape[0] - 1)
         cols = np.clip(cells[:, 1, None, None] + right, 0, near.shape[1] - 1)
         found.append(near[rows, cols])
@@ -199,7 +185,7 @@ def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Deco
     order = []
     for name in SCORERS:
         distance = _distances(windows, name, here, far)
-        order.append(far[np.argsort(distance, kind="stable")])
+        order.append(far[_ascending(distance)])
         if name == "distance":
             misses = float(distance.min()) / math.sqrt(windows.polar[here].size)
     spacing_m = min_distance_m(windows.radius_m)
@@ -211,10 +197,20 @@ def mine(windows: Windows, center_m: tuple[float, float], *, count: int) -> Deco
     )
 
 
+def _ascending(values: Floats) -> NDArray[np.int64]:
+    """Return what a stable `argsort` of values that are not negative does, in a quarter of its time."""
+    # Their bits sort as they do, and behind these stands the place of each.
+    keys = values.astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+    keys |= np.arange(len(values), dtype=np.uint64)
+    keys.sort()
+    return keys.astype(np.uint32).astype(np.int64)
+
+
 def _overlap(shares: Floats, here: int, far: NDArray[np.int64]) -> float:
     """Return the largest overlap of fractions in rings with another place: 1 minus the Bray-Curtis dissimilarity."""
-    difference = np.abs(shares[far] - shares[here]).sum(axis=1)
-    total = (shares[far] + shares[here]).sum(axis=1)
+    # All places, as to pick out those afar takes longer.
+    difference = np.abs(shares - shares[here]).sum(axis=1)[far]
+    total = (shares + shares[here]).sum(axis=1)[far]
     return 1.0 - float(np.divide(difference, total, out=np.zeros_like(difference), where=total > 0).min())
 
 
@@ -225,22 +221,26 @@ def min_distance_m(radius_m: float) -> float:
 
 def _distances(windows: Windows, name: str, here: int, far: NDArray[np.int64]) -> Floats:
     if name in windows.plain:
-        table = windows.plain[name]
-        return np.asarray(np.linalg.norm(table[far] - table[here], axis=1))
+        return _away(windows.plain[name], here)[far]
     # The magnitude of the spectrum does not depend on rotation and gives the short list; there the best one counts.
-    rough = np.linalg.norm(windows.spectrum[far] - windows.spectrum[here], axis=1)
+    rough = _away(windows.spectrum, here)[far]
     # 400 places whose best rotation is searched; the others are too different at any rotation
-    short = np.argsort(rough, kind="stable")[:400]
+    short = _ascending(rough)[:400]
     ours, theirs = windows.polar[here], windows.polar[far[short]]
     turned = np.stack([np.roll(ours, turn, axis=1) for turn in range(_SECTORS)]).reshape(_SECTORS, -1)
     flat = theirs.reshape(len(short), -1)
     squared = (flat**2).sum(axis=1)[:, None] - 2 * flat @ turned.T + (turned**2).sum(axis=1)[None, :]
     best = np.sqrt(np.maximum(squared.min(axis=1), 0.0))
-    distance = np.full(len(far), np.inf, dtype=np.float32)
+    distance = best.max() + rough
     distance[short] = best
-    beyond = np.setdiff1d(np.arange(len(far)), short)
-    distance[beyond] = best.max() + rough[beyond]
-    return distance
+    return np.asarray(distance, dtype=np.float32)
+
+
+def _away(table: Floats, here: int) -> Floats:
+    """Return the Euclidean distance of each row from one."""
+    difference = table - table[here]
+    np.multiply(difference, difference, out=difference)
+    return np.asarray(np.sqrt(difference.sum(axis=1)))
 
 
 def _in_turn(

@@ -19,7 +19,7 @@ from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun, draw_cond
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.sensing.rendering.scene import make_scene
 from sasgeo_bench.sensing.rendering.seasons import Season
-from sasgeo_bench.sensing.rendering.view import labels, render
+from sasgeo_bench.sensing.rendering.view import render_labelled
 from sasgeo_bench.tasks.frame_evidence import poses_before, unseen
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import PAINTED, PERCEIVED, Detector
@@ -124,10 +124,9 @@ class PictureSuite(Suite):
         beliefs = camera_beliefs(shot, flight)
         rng = shot.rng("sensor", variant.name)
         wider = flight.height_m * LENS.width_px / LENS.focal_px[0] / variant.side_m
-        taken = [render(painted, belief.true, conditions, rng) for belief in beliefs]
-        pictures = [self.change(shot, _overlapping(shot, flight, rgb, axis=1, wider=wider)) for rgb in taken]
-        mapped = [labels(painted, belief.true, season=conditions.season) for belief in beliefs]
-        found = [_overlapping(shot, flight, planes, axis=2, wider=wider) for planes in mapped]
+        taken = [render_labelled(painted, belief.true, conditions, rng) for belief in beliefs]
+        pictures = [self.change(shot, _overlapping(shot, flight, rgb, axis=1, wider=wider)) for rgb, _ in taken]
+        found = [_overlapping(shot, flight, planes, axis=2, wider=wider) for _, planes in taken]
         state = shot.scene.world
         is_there = "building" in state.classes
         share = float((found[-1][state.classes.index("building")] == 1).mean()) if is_there else 0.0

@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is added to a draft tells nothing of the answer: priors, candidates and ids are the same for all variants."""
 
+from collections import Counter
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
-from sasgeo_bench.regions.evidence import LayerBits
+from sasgeo_bench.regions.evidence import Evidence, LayerBits
+from sasgeo_bench.tasks import sampling
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH
-from sasgeo_bench.tasks.sampling import CANDIDATES, LEAST_CANDIDATES, UNANSWERABLE, Drawer
+from sasgeo_bench.tasks.sampling import CANDIDATES, LEAST_CANDIDATES, UNANSWERABLE, Drafts, Drawer
 from sasgeo_bench.tasks.split import SplitFile, make_split
+from sasgeo_bench.tasks.suites.base import QueryDraft
 from sasgeo_bench.tasks.suites.mining import STRIDE_M, min_distance_m
+from sasgeo_bench.tasks.task_files import query_row
 
 SITES = 2  # of a suite, whose drafts are dear
 MORE_SITES = {"alias": 3}  # where chance is judged over few queries of a site
@@ -247,3 +251,36 @@ def test_a_disc_counts_as_much_as_of_it_is_mapped(drawn):
     assert share_of(((west + east) / 2, middle), 400.0) == 1
     assert share_of((west, middle), 400.0) == pytest.approx(0.5, abs=0.02)
     assert share_of((west - 500.0, middle), 400.0) == 0
+
+
+@pytest.mark.parametrize("room_bytes", [0, 10_000, 2**26])
+def test_queries_drawn_together_are_those_drawn_one_by_one_whatever_room_there_is(drawn, room_bytes, monkeypatch):
+    monkeypatch.setattr(sampling, "KEPT_BYTES", room_bytes)
+    made, drawer, _ = drawn("occlusion")
+    jobs = drawer.jobs(made.sites[:1])
+    assert len({(job.site.index, job.variant) for job in jobs}) == len(jobs) / 2  # two tracks
+    for job, (query, truth) in zip(jobs, drawer.drawn(jobs), strict=True):
+        alone, its_truth = drawer.draw(job)
+        np.testing.assert_array_equal(query.evidence.cells, alone.evidence.cells)
+        assert query_row(query) == query_row(alone)
+        assert truth == its_truth
+
+
+def test_a_draft_is_drawn_once_while_there_is_room_and_its_room_is_free_again_after_the_last_who_asks():
+    cells, times = np.zeros((2, 8, 8), dtype=np.uint8), []
+
+    def draw():
+        times.append(1)
+        return QueryDraft(evidence=Evidence(classes=("water", "green"), cells=cells + len(times) % 2, cell_size_m=1.0))
+
+    drafts = Drafts(asked=Counter({"one": 3, "two": 2}), room_bytes=30)
+    first = drafts.of("one", 0, draw)
+    assert np.array_equal(drafts.of("one", 0, draw).evidence.cells, first.evidence.cells)
+    assert len(times) == 1
+    assert drafts.room_bytes == 30 - cells.size / 4
+    drafts.of("two", 0, draw)
+    drafts.of("two", 0, draw)  # there was no room for it
+    assert len(times) == 3
+    for _ in range(3):
+        drafts.leave("one")
+    assert drafts.room_bytes == 30

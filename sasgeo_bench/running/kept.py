@@ -23,6 +23,7 @@ from pydantic import JsonValue
 
 from sasgeo_bench.core.errors import SasgeoError, StoreError
 from sasgeo_bench.core.folders import fresh_folder, locked, remove_tree
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.regions.region import Manifest
@@ -128,7 +129,7 @@ def seal(folder: Path) -> None:
 
 def _is_whole(folder: Path) -> bool:
     try:
-        sizes = json.loads((folder / ABOUT).read_text(encoding="utf-8"))
+        sizes = json.loads(plain_file(folder / ABOUT).read_text(encoding="utf-8"))
         return bool(sizes) and all((folder / name).stat().st_size == size for name, size in sizes.items())
     except (OSError, ValueError, AttributeError):
         return False
@@ -185,7 +186,7 @@ def code_hash() -> str:
     """Return the SHA-256 of all files of this package: a change in any makes all anew."""
     package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     for path in sorted((*package.rglob("*.py"), *package.rglob("*.toml"))):
-        data = path.read_bytes()
+        data = plain_file(path).read_bytes()
         digest.update(f"{path.relative_to(package).as_posix()}\0{len(data)}\0".encode() + data)
     return digest.hexdigest()
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 
 from sasgeo_bench.core.errors import MatchError
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.matching.follower import Follower
 from sasgeo_bench.matching.matcher import (
     Matcher,
@@ -139,7 +140,7 @@ class Maps(Mapping[str, Region]):
 
 def _resident_bytes() -> int:
     try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        pages = int(plain_file(Path("/proc/self/statm")).read_text(encoding="ascii").split()[1])
     except OSError:  # no Linux
         import psutil  # noqa: PLC0415 - takes longer to import than a town to prepare
 

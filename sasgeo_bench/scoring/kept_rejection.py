@@ -23,6 +23,7 @@ import pyarrow as pa
 
 from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.core.folders import fresh_file
+from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.plugins import SHIPPED_MODULES
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.tasks.split import Split
@@ -78,7 +79,7 @@ class KeptJudgements:
         if path is None:
             return None
         try:
-            data = memoryview(path.read_bytes())
+            data = memoryview(plain_file(path).read_bytes())
             os.utime(path)
         except OSError:
             return None
@@ -140,7 +141,7 @@ def _digest(files: tuple[tuple[Path, int], ...]) -> bytes:
     versions = sorted({(str(one.name), one.version) for one in distributions()})
     digest = hashlib.sha256(repr((sys.version, platform.platform(), versions)).encode())
     for path, _ in files:
-        digest.update(repr(str(path)).encode() + hashlib.sha256(path.read_bytes()).digest())
+        digest.update(repr(str(path)).encode() + hashlib.sha256(plain_file(path).read_bytes()).digest())
     return digest.digest()
 
 

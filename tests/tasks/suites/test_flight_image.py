@@ -15,6 +15,7 @@ from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.suites.pictures import ATTITUDE_SIGMA_DEG
 
 NAME = "flight-image"
+NOTHING = (np.zeros((8, 8, 3), dtype=np.uint8), np.zeros((13, 8, 8), dtype=np.uint8))  # seen, with its labels
 
 
 def rgb(query):
@@ -53,8 +54,7 @@ def test_light_and_season_last_for_a_flight_and_a_falsifier_has_other_noise_alon
 def test_weather_is_drawn_once_for_a_flight(flown, monkeypatch):
     made = flown(NAME)
     seen = []
-    monkeypatch.setattr(pictures, "render", lambda *args: seen.append(args[2]) or np.zeros((8, 8, 3), dtype=np.uint8))
-    monkeypatch.setattr(pictures, "labels", lambda *_, **__: np.zeros((13, 8, 8), dtype=np.uint8))
+    monkeypatch.setattr(pictures, "render_labelled", lambda *args: seen.append(args[2]) or NOTHING)
     monkeypatch.setattr(pictures, "_painted", lambda *_: None)
     monkeypatch.setattr(pictures.FrameLabels, "of", lambda *_: None)
     drawer = FlightDrawer(airspace=made.airspace, flights={0: made.flight}, choice=Choice(kinds=("F9 snow",)))
@@ -76,8 +76,7 @@ def test_a_place_is_painted_once_for_all_variants(flown, monkeypatch):
     made, painted = flown(NAME), []
     anything = next(iter(made.airspace.scene.painted.values()))
     monkeypatch.setattr(pictures, "make_scene", lambda *_, window, **__: painted.append(window) or anything)
-    monkeypatch.setattr(pictures, "render", lambda *_: np.zeros((8, 8, 3), dtype=np.uint8))
-    monkeypatch.setattr(pictures, "labels", lambda *_, **__: np.zeros((13, 8, 8), dtype=np.uint8))
+    monkeypatch.setattr(pictures, "render_labelled", lambda *_: NOTHING)
     scene = replace(made.airspace.scene, painted={})
     drawer = FlightDrawer(airspace=replace(made.airspace, scene=scene), flights={0: made.flight})
     ids = [query.query_id for query, _ in drawer.drawn(drawer.jobs([made.flight.site]))]

@@ -98,7 +98,7 @@ def kept_of(
         if shelf is None or manifest.digest != digest:
             return None
         # Settings, the map, all code of ours, the libraries, the processor: whatever the result may follow from
-        about = [what, dict(settings), digest, code_hash(), _versions()]
+        about = [what, dict(settings), digest, code_hash(), installed()]
         folder = shelf / hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
         with locked(folder):
             if not _is_whole(folder):
@@ -192,7 +192,7 @@ def code_hash() -> str:
 
 
 @cache
-def _versions() -> list[str]:
+def installed() -> list[str]:
     """Return names and versions of all that is installed, as its folders are called, and of Python and the computer."""
-    installed = {path.name for entry in sys.path if entry for path in Path(entry).glob("*-info")}
-    return [*sorted(installed), platform.python_version(), platform.machine(), platform.node()]
+    found = {path.name for entry in sys.path if entry for path in Path(entry).glob("*-info")}
+    return [*sorted(found), platform.python_version(), platform.platform(), platform.node()]

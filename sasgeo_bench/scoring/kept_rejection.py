@@ -6,14 +6,12 @@ The name of a file is the hash of all that its content follows from; a file that
 
 import hashlib
 import os
-import platform
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import distributions
 from pathlib import Path
 from typing import Final, NamedTuple, Self
 
@@ -25,6 +23,7 @@ from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.plugins import SHIPPED_MODULES
+from sasgeo_bench.running.kept import installed
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.tasks.split import Split
 
@@ -32,7 +31,6 @@ MOST_DAYS: Final = 30  # a file that is not read for so long is removed
 _SUFFIX: Final = ".rejection"
 _DAY_S: Final = 86_400
 _ID: Final = "query_id"
-_OURS: Final = __name__.partition(".")[0]
 
 
 class Judgement(NamedTuple):
@@ -138,8 +136,7 @@ def _programs() -> bytes | None:
 @cache
 def _digest(files: tuple[tuple[Path, int], ...]) -> bytes:
     """Return the SHA-256 of files as they were at some time, and of what is below them."""
-    versions = sorted({(str(one.name), one.version) for one in distributions()})
-    digest = hashlib.sha256(repr((sys.version, platform.platform(), versions)).encode())
+    digest = hashlib.sha256(repr(installed()).encode())
     for path, _ in files:
         digest.update(repr(str(path)).encode() + hashlib.sha256(plain_file(path).read_bytes()).digest())
     return digest.digest()

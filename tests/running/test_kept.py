@@ -121,7 +121,7 @@ def test_what_is_there_is_not_made_again_but_for_another_map_other_settings_or_o
     assert asked(region, "chart", **SETTINGS) == first
     assert len(here) == 1
     others = [asked(region, "chart", **SETTINGS | {"reach_m": 5.0}), asked(region, "graph")]
-    for name in ("code_hash", "_versions"):
+    for name in ("code_hash", "installed"):
         monkeypatch.setattr(kept, name, lambda: "changed")
         others.append(asked(region, "chart", **SETTINGS))
     assert len({first, *others}) == len(here) == 5

@@ -152,7 +152,7 @@ def test_code_and_libraries_of_other_versions_are_another_program(tmp_path, monk
     assert before == of_program("limit = 1")
     assert of_program("limit = 2", changed_s=time.time() + 1) is None  # since this process began
     others = [of_program("limit = 2", changed_s=2e8), of_program("limit = 1", changed_s=3e8, name="other.py")]
-    monkeypatch.setattr(kept_rejection, "distributions", list)
+    monkeypatch.setattr(kept_rejection, "installed", list)
     kept_rejection._digest.cache_clear()
     others.append(kept_rejection._programs())
     assert len({before, *others}) == 4

@@ -2,7 +2,6 @@
 """The process that makes what is kept of a map (`running.kept`): code of ours alone, no plugin is imported."""
 
 import json
-import os
 import signal
 import sys
 from collections.abc import Callable, Mapping
@@ -11,14 +10,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from sasgeo_bench.core.errors import ConfigError, StoreError
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError
+from sasgeo_bench.core.folders import fresh_folder, locked, remove_tree
+from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.regions.region_files import read_manifest, read_region
-from sasgeo_bench.running import kernel
-from sasgeo_bench.running.kept import code_hash, seal
+from sasgeo_bench.running.kept import bytes_of, code_hash, is_whole, make_room, seal
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.raster import store_field
 from sasgeo_bench.search.view import Chart
 
+LONGEST_S: Final = 600  # that an order may take: a tenth of it is a map of 100 km2
 _FACTORS: Final = (1, 2, 4, 8, 16)  # views of up to 1 km; the next level takes as long as all of these
 
 
@@ -46,15 +47,22 @@ def _graph(region: Path, into: Path) -> None:
 MAKERS: Final[Mapping[str, Callable[..., None]]] = {"field": _field, "chart": _chart, "graph": _graph}
 
 
-def make(region: Path, into: Path, what: str, settings: Mapping[str, Any], *, digest: str) -> None:
-    """Make a kind of `MAKERS` of a map by some settings, in an empty folder, which counts as whole at the end.
+def keep(region: Path, folder: Path, what: str, settings: Mapping[str, Any], *, digest: str) -> None:
+    """Make a kind of `MAKERS` of a map by some settings in a folder, unless it is there: whole or not at all.
 
-    `digest` is the `Manifest.digest` of the map. Raise `StoreError` if the map is another one, or damaged.
+    `digest` is the `Manifest.digest` of the map. Raise `StoreError` if the map is another one, or damaged, or if there
+    is no room.
     """
     _check(region, digest)
-    MAKERS[what](region, into, **settings)
-    _check(region, digest)
-    seal(into)
+    with locked(folder):
+        if is_whole(folder):
+            return
+        remove_tree(folder)
+        make_room(bytes_of(read_manifest(region)))
+        with fresh_folder(folder) as scratch:
+            MAKERS[what](region, scratch, **settings)
+            _check(region, digest)
+            seal(scratch)
 
 
 def _check(region: Path, digest: str) -> None:
@@ -63,16 +71,24 @@ def _check(region: Path, digest: str) -> None:
 
 
 def main() -> None:
-    """Make what standard input orders."""
-    kernel.prctl(kernel.PR_SET_PDEATHSIG, signal.SIGKILL)  # with whoever ordered it, who holds the lock of the folder
-    order = json.loads(sys.stdin.read())
-    if order.pop("by") != os.getppid():
-        raise StoreError("whoever ordered it is gone")
-    if order.pop("code") != code_hash():  # it would lie under the name of what other code makes
+    """Keep what standard input orders, each thing by itself.
+
+    Whoever ordered it may have ended meanwhile; what is interrupted, or takes too long, leaves nothing behind.
+    """
+    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGALRM, _stop)
+    signal.alarm(LONGEST_S)
+    order, faults = json.loads(sys.stdin.read()), []
+    if order["code"] != code_hash():  # it would lie under the name of what other code makes
         raise StoreError("the program was changed meanwhile")
-    order |= {name: Path(order[name]) for name in ("region", "into")}
-    make(**order)
+    for wanted in order["wanted"]:
+        try:
+            keep(Path(order["region"]), Path(wanted.pop("folder")), **wanted)
+        except (SasgeoError, OSError, ValueError, TypeError, KeyError) as error:
+            faults.append(message_of(error))
+    if faults:
+        sys.exit(faults[0])
 
 
-if __name__ == "__main__":
-    main()
+def _stop(number: int, _: object) -> None:
+    sys.exit(f"it was stopped by {signal.Signals(number).name}")

@@ -12,17 +12,20 @@ import platform
 import shutil
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Final
+from queue import Queue
+from tempfile import TemporaryFile
+from typing import Any, Final
 
 from pydantic import JsonValue
 
 from sasgeo_bench.core.errors import SasgeoError, StoreError
-from sasgeo_bench.core.folders import fresh_folder, locked, remove_tree
+from sasgeo_bench.core.folders import remove_tree
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
@@ -34,8 +37,11 @@ MOST_MB: Final = 4000
 LEAST_CELLS: Final = 2048**2  # of a map: a smaller one is made in less time than a process takes to start
 FITS: Final = "rejectors"  # the folder beside it (`boards.archive`)
 ABOUT: Final = "kept.json"  # written last: sizes of the other files
-_MAKER: Final = "sasgeo_bench.running.keeper"
+# Of the lowest priority that still gets a thirtieth of a processor, where matchers want all of them
+_MAKER: Final = "import os; os.nice(15); from sasgeo_bench.running.keeper import main; main()"
 _LEFT_S: Final = 86_400  # nothing is made for a day: what is older was left by a process that was killed
+_BEGUN: Final = threading.Lock()  # taken once, by who starts the thread that serves orders
+_ORDERS: Final = Queue[tuple[Path, list[Mapping[str, Any]]]]()
 
 
 def kept_folder() -> Path:
@@ -74,10 +80,8 @@ def shelf_of(region: Path) -> Path | None:
     return None
 
 
-def kept_of(
-    region: Path, what: str, settings: Mapping[str, JsonValue], *, digest: str, timeout_s: float
-) -> Path | None:
-    """Return the folder of what is made of a map by some settings, made now if it is not there; None if that fails.
+def kept_of(region: Path, what: str, settings: Mapping[str, JsonValue], *, digest: str) -> Path | None:
+    """Return the folder of what is kept of a map by some settings, in a cache that may be read-only; None without it.
 
     Parameters
     ----------
@@ -89,31 +93,54 @@ def kept_of(
         Arguments of that maker.
     digest : str
         `Manifest.digest` of the map that the asking process has read: of a map that was built anew, nothing is given.
-    timeout_s : float
-        Seconds that it may take.
     """
-    try:
-        manifest = read_manifest(region)
-        shelf = shelf_of(region)
-        if shelf is None or manifest.digest != digest:
-            return None
-        # Settings, the map, all code of ours, the libraries, the processor: whatever the result may follow from
-        about = [what, dict(settings), digest, code_hash(), installed()]
-        folder = shelf / hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
-        with locked(folder):
-            if not _is_whole(folder):
-                remove_tree(folder)
-                _make_room(_bytes_of(manifest))
-                with fresh_folder(folder) as scratch:  # cleared by this process, for the other one may be killed
-                    places = {"region": str(region), "into": str(scratch)}
-                    _make({**places, "what": what, "settings": dict(settings), "digest": digest}, timeout_s)
-                    if not _is_whole(scratch):
-                        raise StoreError("it was made in part")
-            os.utime(folder / ABOUT)  # what was not asked for longest is removed first
-    except (SasgeoError, OSError, subprocess.SubprocessError, ValueError) as error:
-        _tell_once(f"nothing is kept of {region.name} ({one_line(str(error))[:200]})")
+    shelf = shelf_of(region)
+    if shelf is None or shelf.name != digest:
         return None
+    folder = shelf / _name_of(what, settings, digest)
+    if not is_whole(folder):
+        return None
+    with suppress(OSError):
+        os.utime(folder / ABOUT)  # what was not asked for longest is removed first
     return folder
+
+
+def _name_of(what: str, settings: Mapping[str, JsonValue], digest: str) -> str:
+    # Settings, the map, all code of ours, the libraries, the processor: whatever the result may follow from
+    about = [what, dict(settings), digest, code_hash(), installed()]
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+
+
+def order(region: Path, wanted: Sequence[Mapping[str, Any]]) -> None:
+    """Have what was asked for in vain made for later processes, by one beside this one; nobody waits for it.
+
+    One order is made at a time. What is at work when this process ends is finished, orders that wait are dropped.
+
+    Parameters
+    ----------
+    region : Path
+        Folder of the map.
+    wanted : sequence of mapping
+        Arguments of `kept_of`: `what`, `settings` and `digest`.
+    """
+    shelf = shelf_of(region) if wanted else None
+    if shelf is not None and os.access(shelf, os.W_OK):
+        if _BEGUN.acquire(blocking=False):
+            threading.Thread(target=_serve, daemon=True).start()
+        _ORDERS.put((region.resolve(), [{**one, "folder": str(shelf / _name_of(**one))} for one in wanted]))
+
+
+def _serve() -> None:
+    while True:
+        region, wanted = _ORDERS.get()
+        try:
+            left = [one for one in wanted if not is_whole(Path(one["folder"]))]  # it was made meanwhile, for another
+            if left:
+                _make(json.dumps({"code": code_hash(), "region": str(region), "wanted": left}))
+        except Exception as error:  # noqa: BLE001 - the next order is served, whatever came of this one
+            _tell_once(f"nothing is kept of {region.name} ({one_line(str(error))[:200]})")
+        finally:
+            _ORDERS.task_done()
 
 
 @cache
@@ -127,7 +154,8 @@ def seal(folder: Path) -> None:
     (folder / ABOUT).write_text(json.dumps(sizes), encoding="utf-8")
 
 
-def _is_whole(folder: Path) -> bool:
+def is_whole(folder: Path) -> bool:
+    """Return whether all that was sealed in a folder is there."""
     try:
         sizes = json.loads(plain_file(folder / ABOUT).read_text(encoding="utf-8"))
         return bool(sizes) and all((folder / name).stat().st_size == size for name, size in sizes.items())
@@ -135,29 +163,28 @@ def _is_whole(folder: Path) -> bool:
         return False
 
 
-def _bytes_of(manifest: Manifest) -> int:
+def bytes_of(manifest: Manifest) -> int:
     """Return about how much is made of a map at most: a byte for each class and cell."""
     return manifest.rows * manifest.cols * (len(manifest.classes) + 1)
 
 
 def _is_worth_it(manifest: Manifest) -> bool:
-    return manifest.rows * manifest.cols >= LEAST_CELLS and 2 * _bytes_of(manifest) <= most_bytes()
+    return manifest.rows * manifest.cols >= LEAST_CELLS and 2 * bytes_of(manifest) <= most_bytes()
 
 
-def _make(order: Mapping[str, JsonValue], timeout_s: float) -> None:
-    made = subprocess.run(  # noqa: S603 - our own module, by our own interpreter
-        [sys.executable, "-P", "-m", _MAKER],
-        input=json.dumps({**order, "by": os.getpid(), "code": code_hash()}).encode(),
-        capture_output=True,
-        timeout=timeout_s,
-        check=False,
-    )
-    if made.returncode:
-        last = made.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-        raise StoreError(f"it cannot be made: {last or f'exit status {made.returncode}'}")
+def _make(ordered: str) -> None:
+    with TemporaryFile("w+") as asked, TemporaryFile("w+", errors="replace") as said:  # pipes end with this process
+        asked.write(ordered)
+        asked.seek(0)
+        command = [sys.executable, "-P", "-c", _MAKER]
+        made = subprocess.run(command, stdin=asked, stdout=said, stderr=said, check=False)  # noqa: S603
+        if made.returncode:
+            said.seek(0)
+            last = said.read().strip().rpartition("\n")[2]
+            raise StoreError(f"it cannot be made: {last or f'exit status {made.returncode}'}")
 
 
-def _make_room(needed: int) -> None:
+def make_room(needed: int) -> None:
     """Remove what was not asked for longest, until so many bytes fit; raise `StoreError` if the disk lacks them."""
     root = kept_folder()
     for left in root.glob("*/.*"):

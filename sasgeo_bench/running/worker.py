@@ -46,7 +46,7 @@ from sasgeo_bench.matching.matcher import (
 from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.failures import LOG, is_disk_error, our_failure
-from sasgeo_bench.running.kept import FITS, kept_folder, kept_of, shelf_of
+from sasgeo_bench.running.kept import FITS, kept_folder, kept_of, order, shelf_of
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import LEAN, WATCH_S, Group, MemoryWatch
@@ -298,12 +298,12 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         *,
         timeout_s: float,
         most_bytes: int = wire.MOST_BYTES,
-        give: Callable[[Message, str, float], Message] | None = None,
+        give: Callable[[Message, str], Message] | None = None,
         **asked_for: wire.Json,
     ) -> PluginReply[AnyCard, Found]:
         """Ask a question of a kind, with its fields and the bytes after it; the methods of a server answer it.
 
-        What the process wants to know before it answers, `give` returns, given its question, the nonce and a deadline.
+        What the process wants to know before it answers, `give` returns, given its question and the nonce.
         """
         nonce = secrets.token_hex(16)  # so that no answer can be made in advance
         try:
@@ -315,7 +315,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
             for _ in range(_MOST_WANTED):
                 if give is None or "wanted" not in answer:
                     break
-                wire.send(channel, give(answer, nonce, deadline), deadline=deadline)
+                wire.send(channel, give(answer, nonce), deadline=deadline)
                 answer, data = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
             came = time.perf_counter()
             reply = self._read(kind, answer, data, nonce=nonce)
@@ -472,6 +472,8 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
     _region: Path | None = None
     _learned: str | None = None
     _seen: int = -1  # which of its processes was asked a query, or taught, last
+    _is_kept: bool = False  # whether something can be kept of its map
+    _missed: list[dict[str, Any]] = field(default_factory=list)  # what it asked for, and was not there
 
     def learn(self, regions: Mapping[str, Path], pairs: Iterable[tuple[bytes, Truth]]) -> Reply:
         """Train on queries, each a row in Arrow's stream format, and their truths, with maps by name."""
@@ -484,15 +486,16 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, given the learned text."""
         self._region, self._learned = region, learned
-        place, is_kept = str(region.resolve()), _shelf(region) is not None
+        self._is_kept, self._missed = _shelf(region) is not None, []
         reply = self._ask(
             "prepare",
             timeout_s=self.limits.prepare_s,
             give=self._given,
-            region=place,
+            region=str(region.resolve()),
             learned=learned,
-            is_kept=is_kept,
+            is_kept=self._is_kept,
         )
+        order(region, self._missed)  # now that the matcher has made its own, so that it waits for nothing
         if reply.status != "ok":
             self.end()
         return reply
@@ -517,16 +520,17 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
             self.end()
         return reply
 
-    def _given(self, asked: Message, nonce: str, deadline: float) -> Message:
+    def _given(self, asked: Message, nonce: str) -> Message:
         """Return the folder of what is kept of the map that is prepared."""
         wants = checked(_WANTED, asked)
         if self._region is None or wants.nonce != nonce:
             raise MatchError("question does not belong to this map")
-        if self._seen == self.starts:  # settings could tell its next process what it saw
+        if not self._is_kept or self._seen == self.starts:  # settings could tell its next process what it saw
             return {"folder": None}
-        timeout_s = max(deadline - time.monotonic(), 0.0) / 2  # the matcher may have to make it itself
-        wanted = wants.wanted
-        folder = kept_of(self._region, wanted.what, wanted.settings, digest=wanted.digest, timeout_s=timeout_s)
+        missed = wants.wanted.model_dump()
+        folder = kept_of(self._region, **missed)
+        if folder is None:
+            self._missed.append(missed)
         return {"folder": None if folder is None else str(folder)}
 
     def _policy(self, scratch: str) -> sandbox.Policy:

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is kept of a map is what would be made, of this map and these settings; and no plugin can change it."""
 
-import io
 import json
 import os
 import pwd
+import select
 import subprocess
 import sys
+import threading
+from contextlib import suppress
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,7 +19,7 @@ from sasgeo_bench.boards.archive import fits_folder
 from sasgeo_bench.cli.doctor import examine
 from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.regions.region_files import read_manifest, read_region
-from sasgeo_bench.running import keeper, kept, sandbox
+from sasgeo_bench.running import keeper, kept, sandbox, worker
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.raster import likeness_by_hand, read_field
@@ -44,9 +47,11 @@ def here(monkeypatch):
     """What is kept is made in this process; the orders in a list."""
     orders = []
 
-    def make(order, _):
-        orders.append(order)
-        keeper.make(**order | {name: Path(order[name]) for name in ("region", "into")})
+    def make(ordered):
+        order = json.loads(ordered)
+        for wanted in order["wanted"]:
+            orders.append(dict(wanted))
+            keeper.keep(Path(order["region"]), Path(wanted.pop("folder")), **wanted)
 
     monkeypatch.setattr(kept, "_make", make)
     return orders
@@ -57,7 +62,12 @@ def town_of(place, task):
 
 
 def asked(region, what, **settings):
-    return kept.kept_of(region, what, settings, digest=read_manifest(region).digest, timeout_s=600.0)
+    """What is kept of the map by some settings, made if it is not there."""
+    wanted = {"what": what, "settings": settings, "digest": read_manifest(region).digest}
+    if kept.kept_of(region, **wanted) is None:
+        kept.order(region, [wanted])
+        kept._ORDERS.join()
+    return kept.kept_of(region, **wanted)
 
 
 def keeping(region):
@@ -130,11 +140,11 @@ def test_what_is_there_is_not_made_again_but_for_another_map_other_settings_or_o
 
 def test_nothing_is_given_of_a_map_that_was_built_anew(place, task, here):
     region = town_of(place, task)
-    assert kept.kept_of(region, "graph", {}, digest="0" * 64, timeout_s=600.0) is None
+    assert kept.kept_of(region, "graph", {}, digest="0" * 64) is None
     assert here == []
-    with pytest.raises(kept.StoreError, match="was built anew meanwhile"):
-        keeper.make(region, kept.shelf_of(region) / "one", "graph", {}, digest="0" * 64)
-    assert not (kept.shelf_of(region) / "one").exists()
+    with pytest.raises(StoreError, match="was built anew meanwhile"):
+        keeper.keep(region, kept.shelf_of(region) / "one", "graph", {}, digest="0" * 64)
+    assert [*kept.shelf_of(region).iterdir()] == []
 
 
 def test_every_statement_of_a_manifest_counts(place, task):
@@ -218,22 +228,27 @@ def test_without_a_cache_nothing_is_kept(fault, place, task, here, tmp_path, mon
     assert fault == "a circle" or words.endswith("name a folder by XDG_CACHE_HOME")
 
 
-@pytest.mark.parametrize("fault", [StoreError("killed"), subprocess.TimeoutExpired("maker", 1.0), None])
+@pytest.mark.parametrize("fault", [StoreError("full"), SystemExit("stopped"), KeyboardInterrupt()])
 def test_of_what_was_made_in_part_nothing_is_left(fault, place, task, monkeypatch):
-    told = []
+    def make(_, into):
+        (into / "known.npy").touch()
+        raise fault
 
-    def make(order, _):
-        Path(order["into"], "known.npy").touch()
-        if fault:
-            raise fault
-
-    kept._tell_once.cache_clear()
-    monkeypatch.setattr(kept, "_make", make)
-    monkeypatch.setattr(kept, "tell", told.append)
+    monkeypatch.setitem(keeper.MAKERS, "graph", make)
     region = town_of(place, task)
-    assert [asked(region, "graph") for _ in range(2)] == [None, None]
+    with pytest.raises(type(fault)):
+        keeper.keep(region, kept.shelf_of(region) / "one", "graph", {}, digest=read_manifest(region).digest)
     assert [*kept.shelf_of(region).iterdir()] == []
+
+
+def test_what_cannot_be_made_is_told_once(place, task, monkeypatch):
+    told = []
+    monkeypatch.setattr(kept, "tell", told.append)
+    kept._tell_once.cache_clear()
+    region = town_of(place, task)
+    assert [asked(region, "chart", thin=[], reach_m=1e9) for _ in range(2)] == [None, None]
     assert len(told) == 1
+    assert "lines fade within 100 m, not 1000000000.0" in told[0]
 
 
 @pytest.mark.usefixtures("here")
@@ -257,12 +272,42 @@ def test_code_that_changed_since_a_process_began_makes_nothing(place, task, monk
     assert "the program was changed meanwhile" in told[0]
 
 
-def test_a_maker_whose_orderer_is_gone_makes_nothing(monkeypatch):
-    order = {"by": os.getpid(), "code": kept.code_hash()}  # by this process, whose parent is another one
-    monkeypatch.setattr(sys, "stdin", io.StringIO(json.dumps(order)))
-    monkeypatch.setattr(keeper.kernel, "prctl", lambda *_: True)
-    with pytest.raises(StoreError, match="is gone"):
-        keeper.main()
+def of_python(program, **more):
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, **more)  # noqa: S603
+
+
+def test_a_maker_that_is_stopped_leaves_nothing_and_says_why(place, task, shelf):
+    """As one that takes too long is by itself, and one of an interrupted command by the terminal."""
+    region = town_of(place, task)
+    wanted = {"what": "graph", "settings": {}, "digest": read_manifest(region).digest}
+    wanted["folder"] = str(kept.shelf_of(region) / "one")
+    order = {"region": str(region), "wanted": [wanted], "code": kept.code_hash()}
+    program = (
+        "import os, signal; from sasgeo_bench.running import keeper; "
+        "keeper.MAKERS['graph'] = lambda _, into: [(into / 'a').touch(), os.kill(os.getpid(), signal.SIGALRM)]; "
+        "keeper.main()"
+    )
+    assert of_python(program, input=json.dumps(order)).stderr.strip() == "it was stopped by SIGALRM"
+    assert [*shelf.rglob("*")] == [kept.shelf_of(region)]
+
+
+def test_a_run_that_ends_first_leaves_a_whole_map_and_then_no_process(place, task, shelf):
+    region = town_of(place, task)
+    wanted = {"what": "graph", "settings": {}, "digest": read_manifest(region).digest}
+    program = (
+        "import subprocess, sys, threading, pathlib; from sasgeo_bench.running import kept; kept.LEAST_CELLS = 1\n"
+        "class Told(subprocess.Popen):\n"
+        "    def communicate(self, *words, **more):\n"
+        "        print(self.pid, flush=True); has_begun.set(); return super().communicate(*words, **more)\n"
+        "kept.installed()  # asks another program\n"
+        "has_begun, subprocess.Popen = threading.Event(), Told\n"
+        f"kept.order(pathlib.Path({str(region)!r}), [{wanted!r}]); has_begun.wait()"
+    )
+    with suppress(ProcessLookupError):  # it ended before we looked
+        select.select([os.pidfd_open(int(of_python(program).stdout))], [], [])
+    (folder,) = shelf.glob("*/*")
+    assert kept.is_whole(folder)
+    assert len(MappedGraph.open(folder, grid=read_manifest(region).grid).nodes)
 
 
 def test_a_cache_where_plugins_are_imported_from_is_hidden_and_nothing_is_kept_in_it(
@@ -291,19 +336,51 @@ def replies(place, task, spec):
 
 def test_a_matcher_answers_by_what_is_kept_as_without(place, task, shelf, monkeypatch):
     first = replies(place, task, "sasgeo_prior")
+    kept._ORDERS.join()
     folders = sorted(shelf.glob("*/*/"))
     assert len(folders) == 2  # a field and a graph
+    given = []
+    monkeypatch.setattr(
+        worker, "kept_of", lambda *words, **more: given.append(kept.kept_of(*words, **more)) or given[-1]
+    )
+    monkeypatch.setattr(kept, "_make", pytest.fail)
     again = replies(place, task, "sasgeo_prior")
-    assert sorted(shelf.glob("*/*/")) == folders
+    kept._ORDERS.join()
+    assert sorted(given) == folders
     monkeypatch.setenv("SASGEO_KEPT_MB", "0")
     without = replies(place, task, "sasgeo_prior")
     assert [reply.status for reply in (*first, *again, *without)] == ["ok"] * 6
     assert first[1].found == again[1].found == without[1].found
 
 
+def test_a_matcher_waits_for_nothing_that_is_made(place, task, here, monkeypatch):
+    make, may_end = kept._make, threading.Event()
+    monkeypatch.setattr(kept, "_make", lambda ordered: may_end.wait() and make(ordered))
+    try:
+        assert [reply.status for reply in replies(place, task, "graph_only")] == ["ok"] * 2
+        assert [reply.status for reply in replies(place, task, "graph_only")] == ["ok"] * 2
+        assert here == []
+    finally:
+        may_end.set()
+        kept._ORDERS.join()
+    assert [order["what"] for order in here] == ["chart"]  # for both
+
+
+def test_a_cache_that_can_only_be_read_is_read(place, task, here, monkeypatch):
+    region = town_of(place, task)
+    folder = asked(region, "graph")
+    is_writable = os.access
+    monkeypatch.setattr(os, "utime", mock.Mock(side_effect=PermissionError))  # root may write everywhere
+    monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK and is_writable(path, mode))
+    assert asked(region, "graph") == folder
+    assert asked(region, "chart", **SETTINGS) is None
+    assert len(here) == 1
+
+
 @shut_in
 def test_a_matcher_reads_what_is_kept_of_its_map_alone_and_changes_nothing(place, task, shelf):
-    (shelf / "another map").mkdir(parents=True)
+    assert asked(town_of(place, task), "chart", thin=[], reach_m=0.0)
+    (shelf / "another map").mkdir()
     ready, found = replies(place, task, "hostile:ReadsWhatIsKept")
     assert ready.status == "ok", ready.message
     assert found.found.diagnostics == {"is there": 1.0, "other maps": 0.0, "written": 0.0, "nonsense": 0.0}
@@ -314,11 +391,12 @@ def test_a_process_that_has_seen_a_query_is_given_nothing(place, task, here):
     query = task_files.query_bytes(next(iter(task_files.read_queries(task))))
     with Threaded(spec="graph_only", reach=Reach(readable=[region], hidden=[]), limits=Limits()) as worker:
         assert worker.prepare(region).status == "ok"
-        assert len(here) == 1
         assert worker.match(query, top_k=1).status == "ok"
+        kept._ORDERS.join()
         for path in kept.shelf_of(region).iterdir():
             kept.remove_tree(path)
         assert worker.prepare(region).status == "ok"
+    kept._ORDERS.join()
     assert len(here) == 1
 
 

@@ -28,9 +28,9 @@ from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, count
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import METRICS, check_registered, code_of
 from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.room import Room, most_bytes
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.regions.region import LICENCE
-from sasgeo_bench.running.kept import FITS, kept_folder, most_bytes
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import Task
@@ -181,7 +181,7 @@ def request_of(
 def fits_folder() -> Path | None:
     """Return the folder of the user's cache that keeps what rejectors made of answers; None where nothing is kept."""
     with suppress(StoreError):
-        return kept_folder().with_name(FITS) if most_bytes() else None
+        return Room.of_user().fits if most_bytes() else None
     return None
 
 

@@ -17,9 +17,9 @@ from rich.table import Table
 from sasgeo_bench.cli.console import print_table
 from sasgeo_bench.cli.options import ExtractFolders, Out
 from sasgeo_bench.core.errors import ExtractError, StoreError, named
+from sasgeo_bench.core.room import VARIABLE, Room, most_bytes
 from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, Extract, answers, extract_folders, find_extract
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.running.kept import VARIABLE, kept_folder, most_bytes
 
 _LIBRARIES: Final = ("osmium", "shapely", "geopandas", "rasterio", "numpy", "pandas", "pyarrow")
 
@@ -47,17 +47,17 @@ def examine(folders: Sequence[Path], *, out: Path) -> Iterator[tuple[str, str]]:
     is_writable = os.access(root, os.W_OK)
     free_gb = shutil.disk_usage(root).free / 1e9
     yield "output", f"{out.absolute()}, {free_gb:.1f} GB free" + ("" if is_writable else ", NOT WRITABLE")
-    yield "kept of maps", _kept_words()
+    yield "kept of maps and answers", _kept_words()
     yield from _missing(folders)
 
 
 def _kept_words() -> str:
     try:
-        folder = kept_folder()
+        room = Room.of_user()
     except StoreError as error:
         return f"nothing: {error}"
-    kept_mb = sum(path.stat().st_size for path in folder.glob("*/*/*") if path.is_file()) / 1e6
-    return f"{folder}, {kept_mb:.0f} MB of {most_bytes() / 1e6:.0f} ({VARIABLE})"
+    kept_mb = sum(entry.size for entry in room.entries()) / 1e6
+    return f"{room.root}, {kept_mb:.0f} MB of {most_bytes() / 1e6:.0f} ({VARIABLE})"
 
 
 def _missing(folders: Sequence[Path]) -> Iterator[tuple[str, str]]:

@@ -12,9 +12,10 @@ import numpy as np
 
 from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError
 from sasgeo_bench.core.folders import fresh_folder, locked, remove_tree
+from sasgeo_bench.core.room import Room, is_whole, seal
 from sasgeo_bench.core.texts import message_of
 from sasgeo_bench.regions.region_files import read_manifest, read_region
-from sasgeo_bench.running.kept import bytes_of, code_hash, is_whole, make_room, seal
+from sasgeo_bench.running.kept import bytes_of, code_hash
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.raster import store_field
 from sasgeo_bench.search.view import Chart
@@ -58,7 +59,7 @@ def keep(region: Path, folder: Path, what: str, settings: Mapping[str, Any], *, 
         if is_whole(folder):
             return
         remove_tree(folder)
-        make_room(bytes_of(read_manifest(region)))
+        Room.of_user().make(bytes_of(read_manifest(region)))
         with fresh_folder(folder) as scratch:
             MAKERS[what](region, scratch, **settings)
             _check(region, digest)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is made of a large map is kept for later processes: by the program alone, in the user's cache, within a size.
+"""What is made of a large map is kept for later processes, by the program alone, in the user's cache (`core.room`).
 
 A plugin asks for it by name and settings (`Region.kept`); a process of ours without any plugin makes it
 (`running.keeper`), so that no plugin can write what another one reads. A plugin is shown what is kept of its own map.
@@ -9,11 +9,9 @@ import hashlib
 import json
 import os
 import platform
-import shutil
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
@@ -25,48 +23,18 @@ from typing import Any, Final
 from pydantic import JsonValue
 
 from sasgeo_bench.core.errors import SasgeoError, StoreError
-from sasgeo_bench.core.folders import remove_tree
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import tell
+from sasgeo_bench.core.room import Room, is_whole, most_bytes, touch
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
 
-VARIABLE: Final = "SASGEO_KEPT_MB"  # most megabytes that are kept; 0 keeps nothing
-MOST_MB: Final = 4000
 LEAST_CELLS: Final = 2048**2  # of a map: a smaller one is made in less time than a process takes to start
-FITS: Final = "rejectors"  # the folder beside it (`boards.archive`)
-ABOUT: Final = "kept.json"  # written last: sizes of the other files
 # Of the lowest priority that still gets a thirtieth of a processor, where matchers want all of them
 _MAKER: Final = "import os; os.nice(15); from sasgeo_bench.running.keeper import main; main()"
-_LEFT_S: Final = 86_400  # nothing is made for a day: what is older was left by a process that was killed
 _BEGUN: Final = threading.Lock()  # taken once, by who starts the thread that serves orders
 _ORDERS: Final = Queue[tuple[Path, list[Mapping[str, Any]]]]()
-
-
-def kept_folder() -> Path:
-    """Return the folder of all that is kept, in the user's cache (`XDG_CACHE_HOME`); it may be removed at any time.
-
-    Raise `StoreError` if the user has no cache.
-    """
-    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    try:
-        cache_home = named if named.is_absolute() else Path.home() / ".cache"
-    except RuntimeError as error:  # of a user who is only a number, as in containers
-        raise StoreError("you have no home, and so no cache: name a folder by XDG_CACHE_HOME") from error
-    return cache_home / "sasgeo-bench" / "maps"
-
-
-def most_bytes() -> int:
-    """Return how many bytes are kept at most, as `SASGEO_KEPT_MB` says."""
-    return _most_mb(os.environ.get(VARIABLE, "")) * 10**6
-
-
-@cache
-def _most_mb(text: str) -> int:
-    if text and not text.isdecimal():
-        tell(f"{VARIABLE} is {text!r}, no whole number of megabytes: {MOST_MB} are kept at most")
-    return int(text) if text.isdecimal() else MOST_MB
 
 
 def shelf_of(region: Path) -> Path | None:
@@ -74,7 +42,7 @@ def shelf_of(region: Path) -> Path | None:
     with suppress(SasgeoError, OSError, RuntimeError):  # the last one of links in a circle
         manifest = read_manifest(region)
         if _is_worth_it(manifest):
-            shelf = kept_folder().resolve() / manifest.digest
+            shelf = Room.of_user().maps.resolve() / manifest.digest
             shelf.mkdir(mode=0o700, parents=True, exist_ok=True)  # a map may be private
             return shelf
     return None
@@ -100,8 +68,7 @@ def kept_of(region: Path, what: str, settings: Mapping[str, JsonValue], *, diges
     folder = shelf / _name_of(what, settings, digest)
     if not is_whole(folder):
         return None
-    with suppress(OSError):
-        os.utime(folder / ABOUT)  # what was not asked for longest is removed first
+    touch(folder)
     return folder
 
 
@@ -148,21 +115,6 @@ def _tell_once(text: str) -> None:
     tell(text)
 
 
-def seal(folder: Path) -> None:
-    """Record the sizes of the files of what was made, so that it counts as whole."""
-    sizes = {path.name: path.stat().st_size for path in folder.iterdir()}
-    (folder / ABOUT).write_text(json.dumps(sizes), encoding="utf-8")
-
-
-def is_whole(folder: Path) -> bool:
-    """Return whether all that was sealed in a folder is there."""
-    try:
-        sizes = json.loads(plain_file(folder / ABOUT).read_text(encoding="utf-8"))
-        return bool(sizes) and all((folder / name).stat().st_size == size for name, size in sizes.items())
-    except (OSError, ValueError, AttributeError):
-        return False
-
-
 def bytes_of(manifest: Manifest) -> int:
     """Return about how much is made of a map at most: a byte for each class and cell."""
     return manifest.rows * manifest.cols * (len(manifest.classes) + 1)
@@ -182,30 +134,6 @@ def _make(ordered: str) -> None:
             said.seek(0)
             last = said.read().strip().rpartition("\n")[2]
             raise StoreError(f"it cannot be made: {last or f'exit status {made.returncode}'}")
-
-
-def make_room(needed: int) -> None:
-    """Remove what was not asked for longest, until so many bytes fit; raise `StoreError` if the disk lacks them."""
-    root = kept_folder()
-    for left in root.glob("*/.*"):
-        with suppress(OSError):
-            if left.is_dir() and left.stat().st_mtime < time.time() - _LEFT_S:
-                remove_tree(left)
-    known: dict[Path, tuple[float, int]] = {}
-    for about in root.glob(f"*/[!.]*/{ABOUT}"):
-        with suppress(OSError):
-            size = sum(path.stat().st_size for path in about.parent.iterdir())
-            known[about.parent] = (about.stat().st_mtime, size)
-    total = sum(size for _, size in known.values())
-    for folder in sorted(known, key=lambda folder: known[folder][0]):
-        if total + needed <= most_bytes():
-            break
-        remove_tree(folder)
-        total -= known[folder][1]
-        with suppress(OSError):
-            folder.parent.rmdir()  # of a map of which nothing is kept any more
-    if shutil.disk_usage(root).free < 2 * needed:
-        raise StoreError(f"{root} has too little free space")
 
 
 @cache

@@ -27,6 +27,7 @@ from sasgeo_bench.core.config import shipped_dir
 from sasgeo_bench.core.errors import MatchError, StoreError
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import check_card_name, import_paths
+from sasgeo_bench.core.room import Room
 from sasgeo_bench.core.texts import (
     MOST_CANDIDATES,
     MOST_MESSAGE,
@@ -46,7 +47,7 @@ from sasgeo_bench.matching.matcher import (
 from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.failures import LOG, is_disk_error, our_failure
-from sasgeo_bench.running.kept import FITS, kept_folder, kept_of, order, shelf_of
+from sasgeo_bench.running.kept import kept_of, order, shelf_of
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import LEAN, WATCH_S, Group, MemoryWatch
@@ -605,7 +606,8 @@ def _shelf(region: Path) -> Path | None:
 def _open_cache(code: Sequence[Path]) -> list[str]:
     """Return the parts of the user's cache that lie where plugins read, as where their home is the working folder."""
     with contextlib.suppress(StoreError):
-        parts = [os.path.realpath(path) for path in (kept_folder(), kept_folder().with_name(FITS))]
+        room = Room.of_user()
+        parts = [os.path.realpath(path) for path in (room.maps, room.fits)]
         around = [os.path.realpath(path) for path in (*map(str, code), *sandbox.SYSTEM)]
         return [part for part in parts if any(Path(part).is_relative_to(path) for path in around)]
     return []

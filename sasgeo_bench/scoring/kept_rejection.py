@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What rejectors made of the answers of an entry, kept in files, so that a board is scored again without the fits.
 
-The name of a file is the hash of all that its content follows from; a file that nobody reads is removed in time.
+The name of a file is the hash of all that its content follows from.
 """
 
 import hashlib
-import os
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,13 +21,12 @@ from sasgeo_bench.core.errors import StoreError
 from sasgeo_bench.core.folders import fresh_file
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.plugins import SHIPPED_MODULES
+from sasgeo_bench.core.room import Room, touch
 from sasgeo_bench.running.kept import installed
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.tasks.split import Split
 
-MOST_DAYS: Final = 30  # a file that is not read for so long is removed
 _SUFFIX: Final = ".rejection"
-_DAY_S: Final = 86_400
 _ID: Final = "query_id"
 
 
@@ -78,7 +75,7 @@ class KeptJudgements:
             return None
         try:
             data = memoryview(plain_file(path).read_bytes())
-            os.utime(path)
+            touch(path)
         except OSError:
             return None
         if hashlib.sha256(data[32:]).digest() != data[:32]:
@@ -90,16 +87,17 @@ class KeptJudgements:
         return Judgement(judged, figures, acceptance)
 
     def write(self, rejector: str, code: str, found: Judgement) -> None:
-        """Keep a judgement, if it can be written; remove files that are not read any more."""
+        """Keep a judgement, if it can be written and there is room."""
         path = self._path(rejector, code)
         if path is None or not self.scores[_ID].is_unique:
             return
         own = found.judged[[_ID, *found.judged.columns.difference(self.scores.columns, sort=False)]]
         parts = (pa.Table.from_pandas(frame, preserve_index=False) for frame in (own, *found[1:]))
         data = b"".join(_bytes_of(part, compression="zstd") for part in parts)
-        with suppress(OSError, StoreError), fresh_file(path, mend="") as scratch:
-            scratch.write_bytes(hashlib.sha256(data).digest() + data)
-            _sweep(self.folder)
+        with suppress(OSError, StoreError):
+            Room(self.folder.parent).make(len(data))
+            with fresh_file(path, mend="") as scratch:
+                scratch.write_bytes(hashlib.sha256(data).digest() + data)
 
     def _path(self, rejector: str, code: str) -> Path | None:
         """Return the file of a rejector by its module:Class; None of one whose code is not among what was hashed."""
@@ -140,9 +138,3 @@ def _digest(files: tuple[tuple[Path, int], ...]) -> bytes:
     for path, _ in files:
         digest.update(repr(str(path)).encode() + hashlib.sha256(plain_file(path).read_bytes()).digest())
     return digest.digest()
-
-
-def _sweep(folder: Path) -> None:
-    for path in folder.glob(f"*{_SUFFIX}"):
-        if path.stat().st_mtime < time.time() - MOST_DAYS * _DAY_S:
-            path.unlink(missing_ok=True)

@@ -17,7 +17,9 @@ import pytest
 
 from sasgeo_bench.boards.archive import fits_folder
 from sasgeo_bench.cli.doctor import examine
+from sasgeo_bench.core import room
 from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.folders import remove_tree
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running import keeper, kept, sandbox, worker
 from sasgeo_bench.running.worker import Limits, Reach, Worker
@@ -224,7 +226,7 @@ def test_without_a_cache_nothing_is_kept(fault, place, task, here, tmp_path, mon
     assert (kept.shelf_of(region), asked(region, "graph"), here) == (None, None, [])
     assert replies(place, task, "graph_only")[1].status == "ok"
     assert (fits_folder() is None) == (fault == "no home")
-    (words,) = [words for what, words in examine([], out=tmp_path) if what == "kept of maps"]
+    (words,) = [words for what, words in examine([], out=tmp_path) if what == "kept of maps and answers"]
     assert fault == "a circle" or words.endswith("name a folder by XDG_CACHE_HOME")
 
 
@@ -306,7 +308,7 @@ def test_a_run_that_ends_first_leaves_a_whole_map_and_then_no_process(place, tas
     with suppress(ProcessLookupError):  # it ended before we looked
         select.select([os.pidfd_open(int(of_python(program).stdout))], [], [])
     (folder,) = shelf.glob("*/*")
-    assert kept.is_whole(folder)
+    assert room.is_whole(folder)
     assert len(MappedGraph.open(folder, grid=read_manifest(region).grid).nodes)
 
 
@@ -394,7 +396,7 @@ def test_a_process_that_has_seen_a_query_is_given_nothing(place, task, here):
         assert worker.match(query, top_k=1).status == "ok"
         kept._ORDERS.join()
         for path in kept.shelf_of(region).iterdir():
-            kept.remove_tree(path)
+            remove_tree(path)
         assert worker.prepare(region).status == "ok"
     kept._ORDERS.join()
     assert len(here) == 1
@@ -402,9 +404,9 @@ def test_a_process_that_has_seen_a_query_is_given_nothing(place, task, here):
 
 def test_a_size_that_is_none_is_told_once_and_the_usual_one_holds(monkeypatch):
     told = []
-    monkeypatch.setattr(kept, "tell", told.append)
+    monkeypatch.setattr(room, "tell", told.append)
     monkeypatch.setenv("SASGEO_KEPT_MB", "1 GB")
-    assert [kept.most_bytes() for _ in range(2)] == [kept.MOST_MB * 10**6] * 2
+    assert [room.most_bytes() for _ in range(2)] == [room.MOST_MB * 10**6] * 2
     assert told == ["SASGEO_KEPT_MB is '1 GB', no whole number of megabytes: 4000 are kept at most"]
 
 

@@ -9,11 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.room import Room, seal
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.sasgeo.rejectors import SasgeoBoosted, SasgeoLogistic
 from sasgeo_bench.scoring import kept_rejection, rejection
-from sasgeo_bench.scoring.kept_rejection import MOST_DAYS, Judgement
+from sasgeo_bench.scoring.kept_rejection import Judgement
 from sasgeo_bench.scoring.rejection import OWN, RejectionTask, Rule, rules_of
 from tests.scoring.test_integrity import Score, judged_table, split_of_countries
 
@@ -24,6 +26,7 @@ NAME = "sasgeo_logistic"
 def fits(monkeypatch):
     """Return the names of rejectors as they are fitted, on a program that does not change meanwhile."""
     monkeypatch.setattr(kept_rejection, "_programs", lambda: b"program")
+    monkeypatch.setenv("SASGEO_KEPT_MB", "100")
     fitted, judge = [], rejection.judge
 
     def judged(scores, predictions, make, split, *, is_taught):
@@ -201,20 +204,37 @@ def test_of_a_rejector_that_a_function_makes_nothing_is_kept(tmp_path, fits):
     assert fits == [NAME] * 3
 
 
-def test_a_damaged_file_is_computed_anew_and_one_that_nobody_reads_goes(tmp_path, fits):
+def test_a_damaged_file_is_computed_anew(tmp_path, fits):
     some = task(tmp_path)
     plain = rejection._evaluated(some)
     for path in tmp_path.iterdir():
         data = bytearray(path.read_bytes())
         data[len(data) // 2] ^= 1
         path.write_bytes(data)
-    old = tmp_path / f"old{kept_rejection._SUFFIX}"
-    old.touch()
-    os.utime(old, (time.time() - (MOST_DAYS + 1) * 86_400,) * 2)
     assert_same(rejection._evaluated(some), plain)
     assert_same(rejection._evaluated(some), plain)
     assert fits == [NAME] * 2
-    assert not old.exists()
+
+
+def test_maps_and_answers_share_one_size_and_what_was_not_read_longest_goes(tmp_path, fits, monkeypatch):
+    monkeypatch.setenv("SASGEO_KEPT_MB", "1")
+    room = Room(tmp_path)
+    (room.maps / "a map" / "graph").mkdir(parents=True)
+    (room.maps / "a map" / "graph" / "nodes.npy").write_bytes(bytes(400_000))
+    seal(room.maps / "a map" / "graph")
+    room.fits.mkdir()
+    (room.fits / "old").write_bytes(bytes(590_000))
+    (room.fits / ".left.partial").touch()
+    for path in (room.fits / "old", room.fits / ".left.partial"):
+        os.utime(path, (0, 0))
+    rejection._evaluated(task(room.fits))
+    assert [entry.path.parent.name for entry in room.entries()] == ["a map", "rejectors", "rejectors"]
+    assert not {"old", ".left.partial"} & {path.name for path in room.fits.iterdir()}
+    with pytest.raises(StoreError, match="more than SASGEO_KEPT_MB allows"):
+        room.make(1_000_001)
+    room.make(1_000_000)
+    assert [*room.entries()] == [*room.maps.iterdir()] == []
+    assert fits == [NAME]
 
 
 def test_what_cannot_be_written_is_computed_each_time(tmp_path, fits):

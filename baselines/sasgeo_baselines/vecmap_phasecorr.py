@@ -159,7 +159,7 @@ def phases(overlaps: Overlaps, weights: Sequence[float], *, whitening: float) ->
             cross = overlaps.cross(at, at)
             modulus = np.maximum(np.abs(cross), np.float32(_NOTHING))
             total += np.float32(weight) * cross / modulus ** np.float32(whitening)
-    return overlaps.back(np.asarray(total * lowpass(total.shape[-2])))
+    return overlaps.back(np.asarray(total * lowpass(len(overlaps.seen[0]))))
 
 
 @lru_cache(maxsize=8)

@@ -19,9 +19,9 @@ from scipy import fft
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, inverse
 from sasgeo_bench.search.field import Level, Template, bands_of, between, by_fours, pooled, warped
+from sasgeo_bench.search.parts import correlated, map_spectrum
 from sasgeo_bench.search.plan import SPREAD, Disc, Mode, Tile, Turns, place_m, thinned, turns_of
 from sasgeo_bench.search.view import Chart
-from sasgeo_bench.search.vote_search import correlated, map_spectrum
 
 Spectra = NDArray[np.complexfloating]
 

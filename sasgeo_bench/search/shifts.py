@@ -91,7 +91,8 @@ class Overlaps:
     def over(cls, seen: NDArray[np.float32], mapped: Spectra, *, places: tuple[int, ...]) -> Self:
         """Transform a view over a map that is transformed already."""
         size = mapped.shape[-2]
-        spectra = np.conj(fft.fft(fft.rfft(seen, n=size, axis=-1), n=size, axis=-2))
+        spectra = fft.fft(fft.rfft(seen, n=size, axis=-1), n=size, axis=-2)
+        np.conj(spectra, out=spectra)
         totals = seen.sum(axis=(1, 2), dtype=np.float64)
         return cls(seen=tuple(spectra), mapped=mapped, places=places, totals=totals)
 

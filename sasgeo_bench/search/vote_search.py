@@ -390,13 +390,13 @@ class VoteSearch:
         places, high = math.isqrt(len(tiles[0].points_m)), 2 * half + 1
         # Classes that the map lacks here add nothing
         held = [any(tile.layers[band].any() for tile in tiles) for band in range(len(self.view.bands))]
-        blurred = self.view.blurred(step_m)[[*held, True, True]]
+        blurred = np.stack(self.view.blurred(step_m)[[*held, True, True]], axis=-1)
         quarters = self._quarters(places, len(tiles))
         how = (ByRows if places <= _FEW else ByPlanes).of(
-            places=places, high=high, bands=len(blurred), windows=quarters * len(tiles)
+            places=places, high=high, bands=blurred.shape[-1], windows=quarters * len(tiles)
         )
         windows = [how.window(_turned_back(tile.layers[[*held, True]], quarters)) for tile in tiles]
-        for some in self._batches(quarters, how.at_once(len(blurred))):
+        for some in self._batches(quarters, how.at_once(blurred.shape[-1])):
             templates = np.stack(
                 [self.view.turned(blurred, self._turns[at], half=half, step_m=step_m) for at in some[:, 0]]
             )

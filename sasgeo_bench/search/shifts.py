@@ -194,7 +194,7 @@ class ShiftSearch:
         tiles = list(self._tiles(factor, disc))
         found = [mode for modes in self._best(tiles, factor, self._yaws_deg) for mode in modes]
         best = thinned(_ranked(found), plan.apart_m, max(plan.refined, count))
-        return thinned(_ranked(self._refined(mode, disc) for mode in best), plan.apart_m, count)
+        return thinned(_ranked(self._refined(best, disc)), plan.apart_m, count)
 
     def candidates(self, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the best pose near each candidate; None where the map shows nothing."""
@@ -270,21 +270,38 @@ class ShiftSearch:
         # Tiles of one search are of one size
         at_once = max(1, _AT_ONCE // math.prod(tiles[0].mapped.shape[1:]))
         groups = [tiles[first : first + at_once] for first in range(0, len(tiles), at_once)]
+        return self._best_of(groups, factor, [yaws_deg] * len(groups))
+
+    def _best_of(
+        self, groups: Sequence[Sequence["_Tile"]], factor: int, yaws_deg: Sequence[Sequence[float]]
+    ) -> list[list[Mode]]:
+        """Return the `_best` places of each tile in groups that are scored together, each group at its own headings.
+
+        A view is turned and transformed once for all groups that ask for a heading.
+        """
         mapped = [np.stack([tile.mapped for tile in group], axis=1) for group in groups]
         allowed = [np.stack([tile.allowed for tile in group]) for group in groups]
         high = [np.full(places.shape, _LOW, dtype=np.float32) for places in allowed]
         which = [np.zeros(places.shape, dtype=np.int64) for places in allowed]
+        asked: dict[float, list[tuple[int, int]]] = {}
+        for group, yaws in enumerate(yaws_deg):
+            for at, yaw_deg in enumerate(yaws):
+                asked.setdefault(round(yaw_deg, 9), []).append((group, at))
         fours = self._fours(factor)
-        for at, yaw_deg in enumerate(yaws_deg):
+        for yaw_deg, askers in asked.items():
             seen = self._laid(fours, yaw_deg, factor)
             overlaps = Overlaps.over(seen, mapped[0], places=allowed[0].shape).picked(self._distinct[1])
-            for under, places, top, turn in zip(mapped, allowed, high, which, strict=True):
-                scores = self.score(replace(overlaps, mapped=under, places=places.shape))
+            for group, at in askers:
+                places, top, turn = allowed[group], high[group], which[group]
+                scores = self.score(replace(overlaps, mapped=mapped[group], places=places.shape))
                 better = places & (scores > top)
                 np.copyto(top, scores, where=better)
                 np.copyto(turn, at, where=better)
-        found = zip(np.concatenate(high), np.concatenate(which), tiles, strict=True)
-        return [list(self._peaks(*item, yaws_deg)) for item in found]
+        return [
+            list(self._peaks(*item, yaws))
+            for group, tops, turns, yaws in zip(groups, high, which, yaws_deg, strict=True)
+            for item in zip(tops, turns, group, strict=True)
+        ]
 
     def _peaks(
         self, high: NDArray[np.float32], which: NDArray[np.int64], tile: "_Tile", yaws_deg: Sequence[float]
@@ -332,12 +349,19 @@ class ShiftSearch:
         to_view = between(around, inverse(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg)), frame)
         return bands_of(np.stack([warped(four, to_view, around.shape) for four in fours]), len(self._distinct[0]))
 
-    def _refined(self, mode: Mode, disc: Disc) -> Mode:
+    def _refined(self, modes: Sequence[Mode], disc: Disc) -> list[Mode]:
+        """Return the best mode near each, on fine cells."""
+        if not modes:
+            return []
         coarse_m, factor = self.plan.coarse_m, self._factor(self.plan.fine_m)
-        tile = self._around(place_m(mode.pose), coarse_m, factor, disc.wider(coarse_m))
+        tiles = [self._around(place_m(mode.pose), coarse_m, factor, disc.wider(coarse_m)) for mode in modes]
         offsets_deg = self.plan.yaw_step_deg / _STEPS * np.arange(-_STEPS, _STEPS + 1)
-        (found,) = self._best([tile], factor, (mode.pose.yaw_deg + offsets_deg).tolist())
-        return found[0] if found else replace(mode, score=_LOW)
+        yaws_deg = [(mode.pose.yaw_deg + offsets_deg).tolist() for mode in modes]
+        # By heading, so that of equal scores each has that of its first heading, whoever shares it
+        order = sorted(range(len(modes)), key=lambda at: yaws_deg[at])
+        found = self._best_of([[tiles[at]] for at in order], factor, [yaws_deg[at] for at in order])
+        best = dict(zip(order, found, strict=True))
+        return [best[at][0] if best[at] else replace(mode, score=_LOW) for at, mode in enumerate(modes)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,7 +48,7 @@ class UbevTemplate(ShiftMatcher):
             "The camera is taken to look straight down on the middle of the view, so that an orthographic view gets "
             "nothing but blur from the upper layers; all buildings of a layer have one height; scale is 1; no "
             "sequence, no weights by what lasts, no rejection; what is unknown is left out of both sides; no "
-            "confidence; three layers of roofs, each a template, take twice the time of one: more than a second a view"
+            "confidence; three layers of roofs, each a template, take more time than one"
         ),
     )
 

@@ -390,7 +390,7 @@ class VoteSearch:
         places, high = math.isqrt(len(tiles[0].points_m)), 2 * half + 1
         # Classes that the map lacks here add nothing
         held = [any(tile.layers[band].any() for tile in tiles) for band in range(len(self.view.bands))]
-        blurred = np.stack(self.view.blurred(step_m)[[*held, True, True]], axis=-1)
+        blurred = np.ascontiguousarray(self.view.blurred(step_m)[[*held, True, True]].transpose(1, 2, 0))
         quarters = self._quarters(places, len(tiles))
         how = (ByRows if places <= _FEW else ByPlanes).of(
             places=places, high=high, bands=blurred.shape[-1], windows=quarters * len(tiles)

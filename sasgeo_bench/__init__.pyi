@@ -113,6 +113,7 @@ from .search.dense import surface as surface
 from .search.field import Field as Field
 from .search.field import Template as Template
 from .search.find import score_at as score_at
+from .search.parts import Parts as Parts
 from .search.plan import Disc as Disc
 from .search.plan import Mode as Mode
 from .search.plan import thinned as thinned

@@ -6,11 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.shift_matcher import ShiftMatcher
+from sasgeo_baselines.shift_matcher import ShiftMatcher, overlap
 from sasgeo_bench import PRESENT, UNKNOWN, Evidence, MatcherCard, Overlaps
 
 FULL: Final = 255  # of a confidence
-LEAST_CELLS: Final = 1.0  # of a union: less is rounding of the transform
 
 
 class SchmidtSegcorr(ShiftMatcher):
@@ -60,12 +59,8 @@ class SchmidtSegcorr(ShiftMatcher):
         count = len(names)  # the last channel of the map is where it is known
         total, classes = (np.zeros(overlaps.places, dtype=np.float32) for _ in range(2))
         for at in range(count):
-            both = mine = np.zeros(1, dtype=np.float32)
-            if overlaps.totals[at] > 0:  # a class that is not seen overlaps nothing
-                both, mine = overlaps.sums(at, at), overlaps.sums(at, count)
-            either = mine + overlaps.sums(count + at, at) - both
-            is_there = either > LEAST_CELLS
-            total += np.where(is_there, both / np.maximum(either, LEAST_CELLS), 0)
+            over, is_there = overlap(overlaps, at, count + at, at, count)
+            total += over
             classes += is_there
         share = overlaps.sums(2 * count, count) / max(1.0, float(overlaps.totals[-1]))
         is_known = share >= self.numbers["least_share"]

@@ -3,12 +3,44 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.place_matcher import PlaceMatcher
 from sasgeo_bench import Chart, Disc, Evidence, Mode, Overlaps, Pose, Query, Region, ShiftPlan, ShiftSearch
+
+LEAST_CELLS: Final = 1.0  # of a union: less is rounding of the transform
+
+
+def overlap(
+    overlaps: Overlaps, present: int, known: int, band: int, ground: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return intersection over union of a layer of the view and a class of the map, and where either of them has it.
+
+    `present` and `known` are channels of the view, `band` and `ground` the class and the known cells of the map.
+
+    >>> seen = np.stack([np.eye(2), np.ones((2, 2))]).astype(np.float32)
+    >>> mapped = np.stack([np.array([[1, 1], [0, 0]]), np.ones((2, 2))]).astype(np.float32)
+    >>> share, is_there = overlap(Overlaps.of(seen, mapped, places=(1, 1)), 0, 1, 0, 1)
+    >>> share.round(3).tolist(), is_there.tolist()
+    ([[0.3330000042915344]], [[True]])
+    """
+    is_seen, is_mapped = bool(overlaps.totals[present] > 0), overlaps.holds(band)
+    if not (is_seen and is_mapped):  # nothing in common
+        nothing = np.zeros(overlaps.places, dtype=np.float32)
+        alone = (present, ground) if is_seen else (known, band)
+        return nothing, (overlaps.sums(*alone) if is_seen or is_mapped else nothing) > LEAST_CELLS
+    both = overlaps.cross(present, band)
+    either = overlaps.cross(known, band)
+    either -= both
+    either += overlaps.cross(present, ground)
+    shared, either = overlaps.back(np.stack([both, either]))
+    is_there = either > LEAST_CELLS
+    shared /= np.maximum(either, LEAST_CELLS)
+    shared *= is_there
+    return shared, is_there
 
 
 class ShiftMatcher(PlaceMatcher[ShiftSearch]):

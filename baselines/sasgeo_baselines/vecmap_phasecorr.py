@@ -117,11 +117,11 @@ class VecmapPhasecorr(ShiftMatcher):
 
         def note(overlaps: Overlaps, names: tuple[str, ...]) -> NDArray[np.float32]:
             """Note the leads in place of a score."""
-            middle = overlaps.places[0] // 2
+            middle = overlaps.places[-1] // 2
             for at, name in enumerate(names):
                 alone = [float(other == at) for other in range(len(names))]
                 scores = phases(overlaps, alone, whitening=self.numbers["whitening"])
-                near = scores[middle - 1 : middle + 2, middle - 1 : middle + 2].max()
+                near = scores[..., middle - 1 : middle + 2, middle - 1 : middle + 2].max()
                 found[name] = float((near - scores.mean()) / max(float(scores.std()), _NOTHING))
             return np.zeros(overlaps.places, dtype=np.float32)
 
@@ -159,7 +159,7 @@ def phases(overlaps: Overlaps, weights: Sequence[float], *, whitening: float) ->
             cross = overlaps.cross(at, at)
             modulus = np.maximum(np.abs(cross), np.float32(_NOTHING))
             total += np.float32(weight) * cross / modulus ** np.float32(whitening)
-    return overlaps.back(np.asarray(total * lowpass(len(total))))
+    return overlaps.back(np.asarray(total * lowpass(len(overlaps.seen[0]))))
 
 
 @lru_cache(maxsize=8)

@@ -73,6 +73,24 @@ def fours_of(count: int) -> int:
     return -(-count // FOUR)
 
 
+def by_fours(bands: NDArray[Value]) -> NDArray[Value]:
+    """Return bands, shape (B, rows, cols), by fours, shape (G, rows, cols, 4), with zeros in place of missing ones.
+
+    >>> fours = by_fours(np.arange(10.0, dtype=np.float32).reshape(5, 1, 2))
+    >>> fours.shape, fours[1, 0, 0].tolist(), bands_of(fours, 5)[4].tolist()
+    ((2, 1, 2, 4), [8.0, 0.0, 0.0, 0.0], [[8.0, 9.0]])
+    """
+    fours = np.zeros((fours_of(len(bands)), *bands.shape[1:], FOUR), dtype=bands.dtype)
+    for at, band in enumerate(bands):
+        fours[at // FOUR, :, :, at % FOUR] = band
+    return fours
+
+
+def bands_of(fours: NDArray[Value], count: int) -> NDArray[Value]:
+    """Return the first bands of fours, one after the other."""
+    return fours.transpose(0, 3, 1, 2).reshape(-1, *fours.shape[1:3])[:count]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Level:
     """A field in cells of `factor` of its own, with thin classes spread by one cell.

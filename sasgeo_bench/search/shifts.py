@@ -8,6 +8,7 @@ added up. For each heading a matcher gets them (`Overlaps`) and returns a score 
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Final, Self
 
 import cv2
@@ -17,15 +18,17 @@ from scipy import fft
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, inverse
-from sasgeo_bench.search.field import Level, Template, between, pooled, warped
+from sasgeo_bench.search.field import Level, Template, bands_of, between, by_fours, pooled, warped
+from sasgeo_bench.search.parts import correlated, map_spectrum
 from sasgeo_bench.search.plan import SPREAD, Disc, Mode, Tile, Turns, place_m, thinned, turns_of
 from sasgeo_bench.search.view import Chart
-from sasgeo_bench.search.vote_search import correlated, map_spectrum
 
 Spectra = NDArray[np.complexfloating]
 
 _TILE: Final = 256  # places a side of a tile: bounds the memory of the transforms
 _LOW: Final = -np.inf
+_FEW: Final = 16  # places a side, up to which matrix products cost less than an inverse transform
+_AT_ONCE: Final = 200_000  # values of the spectra of one channel under tiles that are scored together: a cache of 2 MB
 _STEPS: Final = 4  # headings on either side of a coarse one, where it is refined
 
 
@@ -53,10 +56,12 @@ class Overlaps:
 
     Parameters
     ----------
-    seen, mapped : ndarray of complex64
-        Transforms of the view's channels, conjugate, and of the map's, shapes (V, n, n / 2 + 1) and (M, n, n / 2 + 1).
+    seen : tuple of ndarray of complex64
+        Transforms of the view's V channels, conjugate, shape (n, n / 2 + 1) each; equal channels share one.
+    mapped : ndarray of complex64
+        Transforms of the map's channels, shape (M, n, n / 2 + 1), or (M, T, n, n / 2 + 1) of T tiles.
     places : tuple of int
-        Rows and columns of the tile.
+        Rows and columns of the tile; before them T, of several tiles.
     totals : ndarray of float64, shape (V,)
         Sum of each channel of the view over its cells.
 
@@ -67,41 +72,75 @@ class Overlaps:
     >>> layers = np.zeros((2, 4, 4), dtype=np.float32)
     >>> layers[1, 2, 0] = 1
     >>> overlaps = Overlaps.of(np.ones((1, 1, 1), dtype=np.float32), layers, places=(3, 3))
-    >>> overlaps.sums(0, 1).round(6).tolist()
+    >>> (overlaps.sums(0, 1).round(6) + 0.0).tolist()
     [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
     """
 
-    seen: Spectra
+    seen: tuple[Spectra, ...]
     mapped: Spectra
-    places: tuple[int, int]
+    places: tuple[int, ...]
     totals: NDArray[np.float64]
 
     @classmethod
-    def of(cls, seen: NDArray[np.float32], mapped: NDArray[np.float32], *, places: tuple[int, int]) -> Self:
+    def of(cls, seen: NDArray[np.float32], mapped: NDArray[np.float32], *, places: tuple[int, ...]) -> Self:
         """Transform a view, shape (V, h, h), and the map under it at all places, shape (M, h + rows - 1, ...)."""
         size = size_of(max(mapped.shape[1:]))
         return cls.over(seen, map_transform(mapped, size), places=places)
 
     @classmethod
-    def over(cls, seen: NDArray[np.float32], mapped: Spectra, *, places: tuple[int, int]) -> Self:
+    def over(cls, seen: NDArray[np.float32], mapped: Spectra, *, places: tuple[int, ...]) -> Self:
         """Transform a view over a map that is transformed already."""
-        size = mapped.shape[1]
-        rows = np.conj(fft.fft(fft.rfft(seen, n=size, axis=-1), n=size, axis=-2))
-        return cls(seen=rows, mapped=mapped, places=places, totals=seen.sum(axis=(1, 2), dtype=np.float64))
+        size = mapped.shape[-2]
+        spectra = fft.fft(fft.rfft(seen, n=size, axis=-1), n=size, axis=-2)
+        np.conj(spectra, out=spectra)
+        totals = seen.sum(axis=(1, 2), dtype=np.float64)
+        return cls(seen=tuple(spectra), mapped=mapped, places=places, totals=totals)
+
+    def picked(self, channels: NDArray[np.int64]) -> Self:
+        """Return these channels of the view, in this order; they may repeat."""
+        seen = tuple(self.seen[channel] for channel in channels.tolist())
+        return replace(self, seen=seen, totals=self.totals[channels])
+
+    def holds(self, mapped: int) -> bool:
+        """Return whether a channel of the map, which is nowhere negative, has anything near the tile."""
+        return bool(self.mapped[mapped, ..., 0, 0].any())  # its sum
 
     def cross(self, seen: int, mapped: int) -> Spectra:
         """Return the cross-power spectrum of a channel of the view and one of the map, for `back`."""
         return np.asarray(self.seen[seen] * self.mapped[mapped])
 
-    def back(self, spectrum: Spectra) -> NDArray[np.float32]:
-        """Return the correlation of a cross-power spectrum at each place, float32 of shape `places`."""
-        size = self.mapped.shape[1]
-        rows, cols = self.places
-        return np.asarray(fft.irfft2(spectrum, s=(size, size))[:rows, :cols], dtype=np.float32)
+    def back(self, spectra: Spectra) -> NDArray[np.float32]:
+        """Return the correlations of cross-power spectra, shape (..., n, n / 2 + 1), at each place, (..., *places)."""
+        size, (rows, cols) = self.mapped.shape[-2], self.places[-2:]
+        if max(rows, cols) <= _FEW:
+            down, across = waves(size, rows, cols)
+            return np.ascontiguousarray((down @ spectra @ across).real, dtype=np.float32)
+        along = fft.ifft(spectra, axis=-2)[..., :rows, :]  # the other rows are not asked for
+        return np.asarray(fft.irfft(along, size, axis=-1)[..., :cols], dtype=np.float32)
 
     def sums(self, seen: int, mapped: int) -> NDArray[np.float32]:
         """Return the sum over cells of a channel of the view times one of the map, float32 of shape `places`."""
         return self.back(self.cross(seen, mapped))
+
+
+@lru_cache(maxsize=8)
+def waves(size: int, rows: int, cols: int) -> tuple[Spectra, Spectra]:
+    """Return the matrices on either side of a spectrum that give the first rows and columns of its plane.
+
+    Examples
+    --------
+    >>> plane = np.arange(20.0).reshape(5, 4)[:4]
+    >>> down, across = waves(4, 2, 3)
+    >>> (down @ fft.rfft2(plane) @ across).real.round(4).tolist()
+    [[0.0, 1.0, 2.0], [4.0, 5.0, 6.0]]
+    """
+    half = size // 2 + 1
+    down, across = (
+        np.exp(2j * np.pi / size * np.outer(*at)) for at in ((range(rows), range(size)), (range(half), range(cols)))
+    )
+    # All but the first and, of an even size, the last column of a spectrum stand for their mirror images, too
+    across *= np.where(np.arange(half) % (size / 2) == 0, 1, 2)[:, None] / size**2
+    return down.astype(np.complex64), across.astype(np.complex64)
 
 
 Scorer = Callable[[Overlaps], NDArray[np.float32]]
@@ -132,7 +171,8 @@ class ShiftSearch:
     cell_size_m : float
         Side of its cells.
     score : callable
-        Returns the score of each place from `Overlaps`, float32; minus infinity where there is none.
+        Returns the score of each place from `Overlaps`, float32; minus infinity where there is none. It is asked about
+        several tiles at once, and about the same view at many headings.
     prior : Prior
         What is known of the pose.
     plan : ShiftPlan
@@ -154,7 +194,7 @@ class ShiftSearch:
         tiles = list(self._tiles(factor, disc))
         found = [mode for modes in self._best(tiles, factor, self._yaws_deg) for mode in modes]
         best = thinned(_ranked(found), plan.apart_m, max(plan.refined, count))
-        return thinned(_ranked(self._refined(mode, disc) for mode in best), plan.apart_m, count)
+        return thinned(_ranked(self._refined(best, disc)), plan.apart_m, count)
 
     def candidates(self, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the best pose near each candidate; None where the map shows nothing."""
@@ -225,19 +265,43 @@ class ShiftSearch:
 
     def _best(self, tiles: Sequence["_Tile"], factor: int, yaws_deg: Sequence[float]) -> list[list[Mode]]:
         """Return the best places of each tile, best first, `apart_m` from each other, each at its best heading."""
-        high = [np.full(tile.allowed.shape, _LOW, dtype=np.float32) for tile in tiles]
-        which = [np.zeros(tile.allowed.shape, dtype=np.int64) for tile in tiles]
-        blurred = self._blurred(factor)
-        for at, yaw_deg in enumerate(yaws_deg):
-            seen = self._laid(blurred, yaw_deg, factor)
-            overlaps: Overlaps | None = None
-            for tile, top, turn in zip(tiles, high, which, strict=True):
-                if overlaps is None:  # tiles of one search are of one size
-                    overlaps = Overlaps.over(seen, tile.mapped, places=tile.allowed.shape)
-                scores = self.score(replace(overlaps, mapped=tile.mapped))
-                better = tile.allowed & (scores > top)
-                top[better], turn[better] = scores[better], at
-        return [list(self._peaks(*item, yaws_deg)) for item in zip(high, which, tiles, strict=True)]
+        if not tiles:
+            return []
+        # Tiles of one search are of one size
+        at_once = max(1, _AT_ONCE // math.prod(tiles[0].mapped.shape[1:]))
+        groups = [tiles[first : first + at_once] for first in range(0, len(tiles), at_once)]
+        return self._best_of(groups, factor, [yaws_deg] * len(groups))
+
+    def _best_of(
+        self, groups: Sequence[Sequence["_Tile"]], factor: int, yaws_deg: Sequence[Sequence[float]]
+    ) -> list[list[Mode]]:
+        """Return the `_best` places of each tile in groups that are scored together, each group at its own headings.
+
+        A view is turned and transformed once for all groups that ask for a heading.
+        """
+        mapped = [np.stack([tile.mapped for tile in group], axis=1) for group in groups]
+        allowed = [np.stack([tile.allowed for tile in group]) for group in groups]
+        high = [np.full(places.shape, _LOW, dtype=np.float32) for places in allowed]
+        which = [np.zeros(places.shape, dtype=np.int64) for places in allowed]
+        asked: dict[float, list[tuple[int, int]]] = {}
+        for group, yaws in enumerate(yaws_deg):
+            for at, yaw_deg in enumerate(yaws):
+                asked.setdefault(round(yaw_deg, 9), []).append((group, at))
+        fours = self._fours(factor)
+        for yaw_deg, askers in asked.items():
+            seen = self._laid(fours, yaw_deg, factor)
+            overlaps = Overlaps.over(seen, mapped[0], places=allowed[0].shape).picked(self._distinct[1])
+            for group, at in askers:
+                places, top, turn = allowed[group], high[group], which[group]
+                scores = self.score(replace(overlaps, mapped=mapped[group], places=places.shape))
+                better = places & (scores > top)
+                np.copyto(top, scores, where=better)
+                np.copyto(turn, at, where=better)
+        return [
+            list(self._peaks(*item, yaws))
+            for group, tops, turns, yaws in zip(groups, high, which, yaws_deg, strict=True)
+            for item in zip(tops, turns, group, strict=True)
+        ]
 
     def _peaks(
         self, high: NDArray[np.float32], which: NDArray[np.int64], tile: "_Tile", yaws_deg: Sequence[float]
@@ -252,8 +316,24 @@ class ShiftSearch:
             yield Mode(pose=pose, score=float(left[at]))
             left[self.plan.apart_m > np.hypot(*(tile.points_m - (east_m, north_m)).T).T] = _LOW
 
-    def _laid(self, blurred: NDArray[np.float32], yaw_deg: float, factor: int) -> NDArray[np.float32]:
-        """Resample a view onto a north-up lattice around its middle, means over its cells, shape (V, side, side)."""
+    @cached_property
+    def _distinct(self) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Return the channels that differ, and which of them each channel is."""
+        at = {channel.tobytes(): index for index, channel in enumerate(self.channels)}
+        chosen = sorted(at.values())
+        which = [chosen.index(at[channel.tobytes()]) for channel in self.channels]
+        return self.channels[chosen], np.array(which, dtype=np.int64)
+
+    def _fours(self, factor: int) -> NDArray[np.float32]:
+        """Return the channels that differ, by fours, averaged over squares as large as a cell."""
+        fours = by_fours(self._distinct[0])
+        size = 2 * round((factor * self.chart.grid.cell_size_m / self.cell_size_m - 1) / 2) + 1
+        if size <= 1:
+            return fours
+        return np.stack([cv2.blur(four, (size, size), borderType=cv2.BORDER_CONSTANT) for four in fours])
+
+    def _laid(self, fours: NDArray[np.float32], yaw_deg: float, factor: int) -> NDArray[np.float32]:
+        """Resample a view onto a north-up lattice around its middle, means over its cells, shape (D, side, side)."""
         step_m, half = factor * self.chart.grid.cell_size_m, self._half(factor)
         side, reach_m = 2 * half + 1, (half + 0.5) * step_m
         around = Grid(epsg=0, west_m=-reach_m, north_m=reach_m, cell_size_m=step_m, rows=side, cols=side)
@@ -267,20 +347,21 @@ class ShiftSearch:
             cols=cols,
         )
         to_view = between(around, inverse(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg)), frame)
-        return np.stack([warped(band, to_view, around.shape) for band in blurred])
+        return bands_of(np.stack([warped(four, to_view, around.shape) for four in fours]), len(self._distinct[0]))
 
-    def _blurred(self, factor: int) -> NDArray[np.float32]:
-        size = 2 * round((factor * self.chart.grid.cell_size_m / self.cell_size_m - 1) / 2) + 1
-        if size <= 1:
-            return self.channels
-        return np.stack([cv2.blur(band, (size, size), borderType=cv2.BORDER_CONSTANT) for band in self.channels])
-
-    def _refined(self, mode: Mode, disc: Disc) -> Mode:
+    def _refined(self, modes: Sequence[Mode], disc: Disc) -> list[Mode]:
+        """Return the best mode near each, on fine cells."""
+        if not modes:
+            return []
         coarse_m, factor = self.plan.coarse_m, self._factor(self.plan.fine_m)
-        tile = self._around(place_m(mode.pose), coarse_m, factor, disc.wider(coarse_m))
+        tiles = [self._around(place_m(mode.pose), coarse_m, factor, disc.wider(coarse_m)) for mode in modes]
         offsets_deg = self.plan.yaw_step_deg / _STEPS * np.arange(-_STEPS, _STEPS + 1)
-        (found,) = self._best([tile], factor, (mode.pose.yaw_deg + offsets_deg).tolist())
-        return found[0] if found else replace(mode, score=_LOW)
+        yaws_deg = [(mode.pose.yaw_deg + offsets_deg).tolist() for mode in modes]
+        # By heading, so that of equal scores each has that of its first heading, whoever shares it
+        order = sorted(range(len(modes)), key=lambda at: yaws_deg[at])
+        found = self._best_of([[tiles[at]] for at in order], factor, [yaws_deg[at] for at in order])
+        best = dict(zip(order, found, strict=True))
+        return [best[at][0] if best[at] else replace(mode, score=_LOW) for at, mode in enumerate(modes)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -212,9 +212,10 @@ class View:
         return np.stack([cv2.blur(band, (size, size), borderType=cv2.BORDER_CONSTANT) for band in self.template])
 
     def turned(self, blurred: NDArray[np.float32], pose: Pose, *, half: int, step_m: float) -> NDArray[np.float32]:
-        """Resample a blurred template onto a north-up lattice around its middle, shape (B + 2, 2 half + 1, 2 half + 1).
+        """Resample a blurred template onto a north-up lattice around its middle, shape (B, 2 half + 1, 2 half + 1).
 
-        Only heading and scale of `pose` matter.
+        `blurred` has its B bands last, (rows, cols, B): those of a cell are read together. Only heading and scale of
+        `pose` matter.
         """
         side = 2 * half + 1
         steps_m, zeros = np.arange(-half, half + 1) * step_m, np.zeros(side)
@@ -224,10 +225,10 @@ class View:
         col = (right_m - self.grid.west_m) / self.grid.cell_size_m
         row = (up_m - self.grid.north_m) / -self.grid.cell_size_m
         inside = (row >= 0) & (row < self.grid.rows) & (col >= 0) & (col < self.grid.cols)
-        at = np.where(inside, np.floor(row) * self.grid.cols + np.floor(col), 0).astype(np.int64).ravel()
-        laid = blurred.reshape(len(blurred), -1).take(at, axis=1)
-        laid *= inside.ravel()
-        return laid.reshape(-1, side, side)
+        at = (np.floor(row[inside]) * self.grid.cols + np.floor(col[inside])).astype(np.int64)
+        laid = np.zeros((blurred.shape[-1], side, side), dtype=blurred.dtype)
+        laid[:, inside] = blurred.reshape(-1, len(laid)).take(at, axis=0).T
+        return laid
 
     def samples(self, template: NDArray[np.float32], *, stride: int) -> "Samples":
         """Return every `stride`-th cell of a template, one at least, with its place in the view."""

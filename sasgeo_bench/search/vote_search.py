@@ -13,6 +13,7 @@ from scipy import fft
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
+from sasgeo_bench.search.parts import Parts
 from sasgeo_bench.search.plan import SPREAD, Disc, Mode, place_m, thinned
 from sasgeo_bench.search.view import NOWHERE, Chart, Patch, Samples, View
 
@@ -69,21 +70,6 @@ def make_template(
     return made
 
 
-def map_spectrum(layers: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.complexfloating]:
-    """Return the conjugate transform of map layers, made once for all templates."""
-    return np.conj(fft.rfft2(layers, s=size))
-
-
-def correlated(
-    window: NDArray[np.complexfloating], template: NDArray[np.complexfloating], size: tuple[int, int]
-) -> NDArray[np.floating]:
-    """Return the correlation summed over bands, for all shifts, of a `map_spectrum` and the spectrum of a template."""
-    total = window[0] * template[0]
-    for layer, band in zip(window[1:], template[1:], strict=True):
-        total += layer * band  # one by one they stay in the cache
-    return np.asarray(fft.irfft2(np.conj(total, out=total), s=size))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spectrum:
     """A template in the Fourier domain: `score` for the layers and for known cells, `counts` for known cells alone."""
@@ -94,19 +80,17 @@ class Spectrum:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ByPlanes:
-    """Votes for templates of `high` cells a side at `places` shifts a side, by transforms of whole squares.
+    """Votes for templates at all shifts by transforms of squares, part by part.
 
     Templates have shape (T, B + 2, high, high), windows (Q, B + 1, side, side), where side = places + high - 1.
     """
 
-    places: int
-    high: int
+    parts: Parts
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Return rows and columns of a transform."""
-        side = fft.next_fast_len(self.places + self.high - 1, real=True)
-        return side, side
+    @classmethod
+    def of(cls, *, places: int, high: int, bands: int = 1, windows: int = 1) -> Self:
+        """Return votes of templates of `high` cells a side and so many bands, at `places` shifts a side of windows."""
+        return cls(parts=Parts.cheapest(places=(places, places), high=high, bands=bands, windows=windows))
 
     def at_once(self, bands: int) -> int:
         """Return how many templates to transform together."""
@@ -114,38 +98,50 @@ class ByPlanes:
         return 1
 
     def window(self, layers: NDArray[np.floating]) -> NDArray[np.complexfloating]:
-        """Transform squares of the map, once for all templates."""
-        return map_spectrum(layers, self.size)
+        """Transform squares of the map under each part, once for all templates; shape (Q, P, B + 1, ...)."""
+        return np.stack([self.parts.windows(square) for square in layers])
 
     def templates(self, templates: NDArray[np.floating]) -> Spectrum:
-        """Transform templates, once for all windows; half of the rows that are all zeros is never computed."""
-        rows, cols = self.size
-        bands = fft.fft(fft.rfft(templates, n=cols, axis=-1), n=rows, axis=-2)
+        """Transform templates, once for all windows."""
+        bands = self.parts.templates(templates)
         return Spectrum(score=bands[..., :-1, :, :], counts=bands[..., -1, :, :])
 
     def votes(
-        self, window: NDArray[np.complexfloating], templates: Spectrum
+        self, window: NDArray[np.complexfloating], templates: Spectrum, least: NDArray[np.floating] | None = None
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Return sums of gains and numbers of known cells, shape (T, Q, places, places) each."""
-        shape = (len(templates.score), len(window), self.places, self.places)
-        total, counted = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        """Return sums of gains and numbers of known cells, shape (T, Q, places, places) each.
+
+        Gains are not summed, and are 0, in parts where no place has the `least` number of known cells, shape (T,).
+        """
+        parts = self.parts
+        shape = (len(templates.score), len(window), *parts.places)
+        total, counted = np.zeros(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
         for at, square in np.ndindex(*shape[:2]):
-            layers = window[square]
-            sums = correlated(layers, templates.score[at], self.size)
-            counts = correlated(layers[-1:], templates.counts[at, None], self.size)
-            total[at, square], counted[at, square] = (part[: self.places, : self.places] for part in (sums, counts))
+            score, counts = templates.score[at], templates.counts[at]
+            for part, layers in zip(parts.slices, window[square], strict=True):
+                here = (at, square, *part)
+                counted[here] = counts[0, 0].real if parts.is_full(layers[-1]) else parts.sums(layers[-1:], [counts])
+                held = np.flatnonzero(layers[:, 0, 0])  # sums of layers: the others add nothing here
+                if len(held) and (least is None or counted[here].max() >= least[at]):
+                    total[here] = parts.sums((layers[band] for band in held), (score[band] for band in held))
         return total, counted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ByRows:
-    """The same votes as `ByPlanes` by transforms of rows alone, which cost less for few places.
+    """The same votes as `ByPlanes` for `places` shifts a side, by transforms of rows alone: less work for few places.
 
     All rows of a template at all places they may have are one matrix product for each frequency.
     """
 
     places: int
     high: int
+
+    @classmethod
+    def of(cls, *, places: int, high: int, bands: int = 1, windows: int = 1) -> Self:
+        """Return votes as `ByPlanes.of` does."""
+        del bands, windows
+        return cls(places=places, high=high)
 
     @property
     def size(self) -> int:
@@ -168,9 +164,10 @@ class ByRows:
         return Spectrum(score=rows[:, : -self.high], counts=rows[:, -self.high :])
 
     def votes(
-        self, window: NDArray[np.complexfloating], templates: Spectrum
+        self, window: NDArray[np.complexfloating], templates: Spectrum, least: NDArray[np.floating] | None = None
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """Return sums of gains and numbers of known cells, shape (T, Q, places, places) each."""
+        del least  # a product of all places costs less than to choose them
         # Map rows under a template at each place: frequencies first, then Q * places, then (B + 1) * high.
         under = np.lib.stride_tricks.sliding_window_view(window, self.high, axis=2).transpose(3, 0, 2, 1, 4)
         under = under.reshape(len(under), len(window) * self.places, -1)
@@ -384,38 +381,41 @@ class VoteSearch:
 
     def _vote(self, tiles: Sequence[_Tile], factor: int) -> list[_Votes]:
         """Return the best score and turn of every place; each template is transformed once for all tiles."""
-        votes = [
-            _Votes(score=np.full(len(tile.points_m), NOWHERE), turn=np.zeros(len(tile.points_m), dtype=np.int64))
-            for tile in tiles
-        ]
         if not tiles:
-            return votes
+            return []
+        best = [np.full(len(tile.points_m), NOWHERE, dtype=np.float32) for tile in tiles]
+        turn = [np.zeros(len(tile.points_m), dtype=np.int64) for tile in tiles]
         step_m = factor * self.chart.grid.cell_size_m
-        half, blurred = self._half(factor), self.view.blurred(step_m)
-        places = math.isqrt(len(tiles[0].points_m))
-        how = (ByRows if places <= _FEW else ByPlanes)(places=places, high=2 * half + 1)
+        half = self._half(factor)
+        places, high = math.isqrt(len(tiles[0].points_m)), 2 * half + 1
+        # Classes that the map lacks here add nothing
+        held = [any(tile.layers[band].any() for tile in tiles) for band in range(len(self.view.bands))]
+        blurred = np.ascontiguousarray(self.view.blurred(step_m)[[*held, True, True]].transpose(1, 2, 0))
         quarters = self._quarters(places, len(tiles))
-        windows = [how.window(_turned_back(tile.layers, quarters)) for tile in tiles]
-        for some in self._batches(quarters, how.at_once(len(blurred))):
+        how = (ByRows if places <= _FEW else ByPlanes).of(
+            places=places, high=high, bands=blurred.shape[-1], windows=quarters * len(tiles)
+        )
+        windows = [how.window(_turned_back(tile.layers[[*held, True]], quarters)) for tile in tiles]
+        for some in self._batches(quarters, how.at_once(blurred.shape[-1])):
             templates = np.stack(
                 [self.view.turned(blurred, self._turns[at], half=half, step_m=step_m) for at in some[:, 0]]
             )
             known = templates[:, -1].sum(axis=(1, 2), dtype=np.float64)
             least = np.where(known > 0, self.plan.least_overlap * known, math.inf).astype(np.float32)
             spectrum = how.templates(templates)
-            for tile, window, best in zip(tiles, windows, votes, strict=True):
-                total, counted = how.votes(window, spectrum)
-                enough = counted >= least[:, None, None, None]
-                # 1e-6 known cells: less is rounding of the transform
-                score = np.where(enough, total / np.maximum(counted, 1e-6), NOWHERE)
+            for tile, window, top, which in zip(tiles, windows, best, turn, strict=True):
+                score, counted = how.votes(window, spectrum, least)
+                is_unknown = counted < least[:, None, None, None]
+                score /= np.maximum(counted, 1e-6, out=counted)  # known cells: less is rounding of the transform
+                np.copyto(score, NOWHERE, where=is_unknown)
                 for k in range(1, quarters):
                     score[:, k] = np.rot90(score[:, k], -k, (1, 2))
                 score = score.reshape(some.size, -1)
-                highest = score.max(axis=0)
-                better = tile.allowed & (highest > best.score)
-                best.score[better] = highest[better]
-                best.turn[better] = some.ravel()[score[:, better].argmax(axis=0)]
-        return votes
+                highest = score.max(axis=0) if some.size > 1 else score[0]
+                better = tile.allowed & (highest > top)
+                np.copyto(top, highest, where=better)
+                which[better] = some.ravel()[score[:, better].argmax(axis=0)] if some.size > 1 else some[0, 0]
+        return [_Votes(score=top.astype(np.float64), turn=which) for top, which in zip(best, turn, strict=True)]
 
     def _quarters(self, places: int, tiles: int) -> int:
         """Return how many headings share a template: 4 if all are searched and windows take little memory, else 1."""

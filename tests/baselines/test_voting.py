@@ -9,6 +9,7 @@ from hypothesis.extra.numpy import arrays
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
+from sasgeo_bench.search.parts import Parts
 from sasgeo_bench.search.view import Chart, Patch, View, fade
 from sasgeo_bench.search.vote_search import ByPlanes, ByRows, VoteGains, make_template
 
@@ -24,18 +25,20 @@ def score_cells(seen: np.ndarray, mapped: np.ndarray, gains: VoteGains) -> float
     return float(total / known) if known else 0.0
 
 
-@pytest.mark.parametrize("how", [ByPlanes, ByRows])
+@pytest.mark.parametrize(
+    "votes",
+    [ByRows(places=4, high=5), *(ByPlanes(parts=Parts(places=(4, 4), high=5, count=count)) for count in (1, 2, 3))],
+)
 @given(
     seen=arrays(np.uint8, (2, 3, 5, 5), elements=st.integers(0, 2)),
     mapped=arrays(np.uint8, (2, 3, 8, 8), elements=st.integers(0, 1)),
     unknown=arrays(np.bool_, (2, 8, 8)),
     gains=GAINS,
 )
-def test_templates_and_windows_together_vote_as_each_pair_does(how, seen, mapped, unknown, gains) -> None:
+def test_templates_and_windows_together_vote_as_each_pair_does(votes, seen, mapped, unknown, gains) -> None:
     known = ~unknown[:, None]
     layers = np.concatenate((mapped * known, known), axis=1).astype(np.float32)
     templates = np.stack([make_template(view, gains) for view in seen]).astype(np.float32)
-    votes = how(places=4, high=5)
     total, counted = votes.votes(votes.window(layers), votes.templates(templates))
     for view, square in np.ndindex(2, 2):
         cells = np.where(unknown[square], UNKNOWN, mapped[square]).astype(np.uint8)

@@ -8,7 +8,6 @@ from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.global_descriptor import separate
@@ -133,15 +132,14 @@ class Question:
 class Search:
     """Spectra of a part of a map: `place` is the lattice of the places that are asked about.
 
-    `channels` are the spectra of those channels that say anything in this part, by their number.
+    `channels` are the numbers of those channels that say anything in this part, `windows` their spectra under each of
+    the `parts`, then those of energy and of known cells.
     """
 
     place: sgb.Grid
-    margin: int
-    shape: tuple[int, int]
-    channels: dict[int, Spectra]
-    energy: Spectra
-    known: Spectra
+    parts: sgb.Parts
+    channels: list[int]
+    windows: Spectra
     least_energy: float
 
     @classmethod
@@ -152,16 +150,16 @@ class Search:
         before = [(max(margin - at, 0), 0) for at in (top, left)]
         channels = np.pad(stack.channels[:, *cut], [(0, 0), *before])
         known = np.pad(stack.is_known[cut], before).astype(np.float32)
-        sizes = (bottom - top + 2 * margin, right - left + 2 * margin)
-        shape = (fft.next_fast_len(sizes[0], real=True), fft.next_fast_len(sizes[1], real=True))
         energy = (channels**2).sum(axis=0)
+        used = [at for at, channel in enumerate(channels) if channel.any()]
+        places = (bottom - top, right - left)
+        parts = sgb.Parts.cheapest(places=places, high=2 * margin + 1, bands=len(used) + 1)
+        beyond = [(0, side + 2 * margin - have) for side, have in zip(places, known.shape, strict=True)]
         return cls(
-            place=grid.window(top, left, bottom - top, right - left),
-            margin=margin,
-            shape=shape,
-            channels={at: _spectrum(channel, shape) for at, channel in enumerate(channels) if channel.any()},
-            energy=_spectrum(energy, shape),
-            known=_spectrum(known, shape),
+            place=grid.window(top, left, *places),
+            parts=parts,
+            channels=used,
+            windows=parts.windows(np.pad(np.stack([*channels[used], energy, known]), [(0, 0), *beyond])),
             least_energy=_NOTHING * float(energy.mean()),
         )
 
@@ -169,24 +167,25 @@ class Search:
         """Return the cosine of view and map at every place, -1..1; -inf where half of the view is off the map."""
         mask = view.is_known.astype(np.float32)
         weight, power = float(mask.sum()), float((view.channels**2).sum())
+        found = np.full(self.place.shape, -np.inf, dtype=np.float32)
         if weight == 0 or power == 0:
-            return np.full(self.place.shape, -np.inf, dtype=np.float32)
-        spectrum = np.conj(_spectrum(mask, self.shape))
-        energy, shared = self._at_places(self.energy * spectrum), self._at_places(self.known * spectrum)
-        summed = np.zeros_like(spectrum)
-        for at, mapped in self.channels.items():
-            if view.channels[at].any():
-                summed += mapped * np.conj(_spectrum(view.channels[at], self.shape))
-        product = self._at_places(summed)
+            return found
+        both = [(at, channel) for at, channel in enumerate(self.channels) if view.channels[channel].any()]
+        *seen, under = self.parts.templates(np.stack([*(view.channels[channel] for _, channel in both), mask]))
         floor = max(self.least_energy * weight, 1e-12)
-        cosine = np.where(energy > floor, product / np.sqrt(power * np.maximum(energy, floor)), 0.0)
-        # 0.5 of a view must lie on known imagery
-        return np.where(shared >= 0.5 * weight, cosine, -np.inf).astype(np.float32)
-
-    def _at_places(self, spectrum: Spectra) -> Planes:
-        rows, cols = self.place.shape
-        along = fft.ifft(spectrum, axis=0)[:rows]  # the other rows are not asked for
-        return np.asarray(fft.irfft(along, self.shape[1], axis=1)[:, :cols], dtype=np.float32)
+        for part, (*mapped, energies, known) in zip(self.parts.slices, self.windows, strict=True):
+            shared = np.float32(weight) if self.parts.is_full(known) else self.parts.sums([known], [under])
+            is_shared = shared >= 0.5 * weight  # of a view that must lie on known imagery
+            if not is_shared.any():
+                continue
+            cosine = np.zeros(self.parts.shape, dtype=np.float32)
+            if seen:
+                energy = self.parts.sums([energies], [under])
+                cosine = self.parts.sums([mapped[at] for at, _ in both], seen)
+                cosine /= np.sqrt(power * np.maximum(energy, floor))
+                cosine[energy <= floor] = 0
+            found[part] = np.where(is_shared, cosine, -np.inf)
+        return found
 
     def field(self, turns: Sequence[sgb.Pose], views: Iterable[Stack]) -> Field:
         """Return the best of all headings and scales, each with its view, at every place; of equal ones the first."""
@@ -195,13 +194,9 @@ class Search:
         for at, (_, view) in enumerate(zip(turns, views, strict=True)):
             scores = self.scores(view)
             better = scores > best
-            best[better], which[better] = scores[better], at
+            np.copyto(best, scores, where=better)
+            np.copyto(which, at, where=better)
         return Field(grid=self.place, scores=best, which=which, turns=tuple(turns))
-
-
-def _spectrum(plane: Planes, shape: tuple[int, int]) -> Spectra:
-    """Return what `rfft2` gives of a plane with zeros beyond it, which are not transformed along the rows."""
-    return np.asarray(fft.fft(fft.rfft(plane, shape[1], axis=1), shape[0], axis=0))
 
 
 def size_for(turns: Sequence[sgb.Pose], side_cells: float) -> int:

@@ -3,8 +3,10 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from itertools import islice, repeat
 from typing import Final
 
 import cv2
@@ -75,18 +77,22 @@ def pooled(mask: NDArray[np.bool_], factor: int) -> Planes:
     return np.asarray(cv2.resize(wide, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def centred(layers: list[Planes] | Planes, known: NDArray[np.bool_]) -> Stack:
+def centred(layers: Sequence[Planes] | Planes, known: NDArray[np.bool_]) -> Stack:
     """Return channels less their mean over what is known, 0 elsewhere; each as strong as any other where it varies.
 
     `known` has shape (rows, cols), or (C, rows, cols) where classes are known at different places.
     """
     found = np.zeros((len(layers), *known.shape[-2:]), dtype=np.float32)
     masks = np.broadcast_to(known, found.shape)
-    for layer, mask, into in zip(layers, masks, found, strict=True):
-        values = layer[mask]
-        if len(values) and values.std() > 0:
-            into[mask] = (values - values.mean()) / values.std()
-    return Stack(channels=found, is_known=np.asarray(masks.any(axis=0)))
+    for at, (layer, mask) in enumerate(zip(layers, masks, strict=True)):
+        count = np.float32(max(int(np.count_nonzero(mask)), 1))
+        channel = np.multiply(layer, mask, out=found[at])
+        channel -= channel.sum() / count
+        channel *= mask
+        spread = np.sqrt(np.square(channel).sum() / count)
+        if spread > 0:
+            channel /= spread
+    return Stack(channels=found, is_known=known if known.ndim < found.ndim else np.asarray(known.any(axis=0)))
 
 
 def _mapped(region: sgb.Region, factor: int) -> Stack:
@@ -252,12 +258,18 @@ class _Part:
     def scores(self, turn: sgb.Pose) -> Planes:
         return self.search.scores(self.view.turned(turn, self.size_px))
 
-    def scale(self, turns: Sequence[sgb.Pose]) -> tuple[np.float32, np.float32]:
+    def scaled(self, turns: Sequence[sgb.Pose]) -> Iterator[Planes]:
+        """Yield the scores of each turn less their mean, over their spread."""
         # 8 headings that tell the mean and the spread of scores
-        some = [self.scores(turn) for turn in turns[:: max(1, len(turns) // 8)]]
-        values = np.concatenate([scores[np.isfinite(scores)] for scores in some])
+        some = {turn: self.scores(turn) for turn in turns[:: max(1, len(turns) // 8)]}
+        values = np.concatenate([scores[np.isfinite(scores)] for scores in some.values()])
         spread = values.std() if len(values) else np.float32(0)
-        return (values.mean(), spread) if spread > 0 else (np.float32(0), np.float32(1))
+        mean, unit = (values.mean(), spread) if spread > 0 else (np.float32(0), np.float32(1))
+        for turn in turns:
+            scores = some.pop(turn) if turn in some else self.scores(turn)
+            scores -= mean
+            scores /= unit
+            yield scores
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,21 +308,18 @@ class _Pair:
         """Return the best sum at every place, for each share of the imagery; None where nothing that counts is seen."""
         weights = [(1.0 - share, share) for share in shares]
         used = [part if any(pair[at] > 0 for pair in weights) else None for at, part in enumerate(self.parts)]
-        scales = [None if part is None else part.scale(self.turns) for part in used]
+        scaled = [repeat(None) if part is None else part.scaled(self.turns) for part in used]
         best = [np.full(self.place.shape, -np.inf, dtype=np.float32) for _ in shares]
         which = [np.zeros(self.place.shape, dtype=np.int32) for _ in shares]
-        for at, turn in enumerate(self.turns):
-            parts = [
-                None if part is None or scale is None else (part.scores(turn) - scale[0]) / scale[1]
-                for part, scale in zip(used, scales, strict=True)
-            ]
+        for at, parts in enumerate(islice(zip(*scaled, strict=False), len(self.turns))):
             for pair, top, mine in zip(weights, best, which, strict=True):
                 summed = zip(pair, parts, strict=True)
                 counted = [np.float32(weight) * part for weight, part in summed if part is not None and weight > 0]
                 if counted:
-                    total = np.sum(counted, axis=0)
+                    total = reduce(np.add, counted)
                     better = total > top
-                    top[better], mine[better] = total[better], at
+                    np.copyto(top, total, where=better)
+                    np.copyto(mine, at, where=better)
         return [
             Field(grid=self.place, scores=top, which=mine, turns=self.turns) if np.isfinite(top).any() else None
             for top, mine in zip(best, which, strict=True)
@@ -329,36 +338,58 @@ class _Pictured:
 
 @dataclass(frozen=True, kw_only=True)
 class _Drawn:
-    """A view of classes: shares of each on pixels of the map, and where each is known, both of shape (C, n, n)."""
+    """A view of classes: shares of each on pixels of the map, and where each is known.
 
-    layers: Planes
-    is_known: NDArray[np.bool_]
+    `seen` are the numbers of the classes of which there is any, `fours` their shares, four at a time, since OpenCV
+    resamples four as fast as one; `masks` are the known cells that differ, and `which` is that of each class seen.
+    """
+
+    count: int
+    seen: list[int]
+    fours: list[Planes]
+    masks: list[Planes]
+    which: list[int]
 
     @classmethod
     def of(cls, query: sgb.Query, classes: tuple[str, ...], *, gsd_m: float) -> "_Drawn | None":
         """Read a view; None where it knows no class of the map, or shows nothing that varies."""
-        seen = query.evidence
+        evidence = query.evidence
         size = max(1, round(side_of(query) / gsd_m))
         layers = np.zeros((len(classes), size, size), dtype=np.float32)
         is_known = np.zeros(layers.shape, dtype=bool)
         for at, name in enumerate(classes):
-            if name in seen.classes:
-                cells = seen.layer(name)
+            if name in evidence.classes:
+                cells = evidence.layer(name)
                 layers[at] = _resized(cells == sgb.PRESENT, size)
                 is_known[at] = _resized(cells != sgb.UNKNOWN, size) > 0.5  # most of a pixel
-        return cls(layers=layers, is_known=is_known) if centred(layers, is_known).channels.any() else None
+        if not centred(layers, is_known).channels.any():
+            return None
+        seen = [at for at, layer in enumerate(layers) if layer.any()]
+        masks = {mask.tobytes(): mask.astype(np.float32) for mask in is_known}
+        filled = np.concatenate([layers[seen], np.zeros((-len(seen) % 4, size, size), dtype=np.float32)])
+        return cls(
+            count=len(classes),
+            seen=seen,
+            fours=[cv2.merge(list(filled[first : first + 4])) for first in range(0, len(filled), 4)],
+            masks=list(masks.values()),
+            which=[list(masks).index(is_known[at].tobytes()) for at in seen],
+        )
 
     def turned(self, turn: sgb.Pose, size_px: int) -> Stack:
         """Return the view north up, if its heading and scale are those of `turn`."""
         along, across = (how(math.radians(turn.yaw_deg)) / turn.scale for how in (math.cos, math.sin))
         turning = np.array([[along, across], [-across, along]])
-        shift = (self.layers.shape[-1] - 1) / 2 - turning @ np.full(2, (size_px - 1) / 2)
+        shift = (len(self.masks[0]) - 1) / 2 - turning @ np.full(2, (size_px - 1) / 2)
         matrix, how = np.column_stack([turning, shift]), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        layers, is_known = (
-            np.array([cv2.warpAffine(plane, matrix, (size_px, size_px), flags=how) for plane in planes])
-            for planes in (self.layers, self.is_known.astype(np.float32))
+        fours, masks = (
+            [np.asarray(cv2.warpAffine(plane, matrix, (size_px, size_px), flags=how)) for plane in planes]
+            for planes in (self.fours, self.masks)
         )
-        return centred(layers, is_known > 0.5)  # most of a pixel
+        layers = np.concatenate([cv2.split(four) for four in fours])[: len(self.seen)]
+        is_known = np.stack(masks) > 0.5  # most of a pixel
+        channels = np.zeros((self.count, size_px, size_px), dtype=np.float32)
+        channels[self.seen] = centred(layers, is_known[self.which] if len(masks) > 1 else is_known[0]).channels
+        return Stack(channels=channels, is_known=np.asarray(is_known.any(axis=0)))
 
 
 def _resized(mask: NDArray[np.bool_], size: int) -> Planes:

@@ -49,6 +49,7 @@ settings.register_profile("search", settings.get_profile("sasgeo"), derandomize=
 settings.load_profile("sasgeo")
 gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of that time
 os.environ["SASGEO_KEPT_MB"] = "0"  # no test reads or writes what the user keeps of maps (tests/running/test_kept.py)
+os.fsync = lambda _: None  # what a test wrote need not outlive a power cut: none waits for the disk
 progress.EVERY_S = math.inf  # else lines of progress come between others wherever the machine is slow
 
 BUILDERS = ("test_build.py", "test_cli.py", "test_results.py", "test_town.py")  # build or start something in each test
@@ -244,13 +245,23 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "_found", found)
 
 
+def _leave_undrawn(patch: pytest.MonkeyPatch) -> None:
+    for name in ("figures_extra", "pictures_extra"):
+        patch.setattr(build, name, lambda *_, **__: AdditionalFiles())
+
+
 @pytest.fixture(scope="module")
 def without_drawings() -> Iterator[None]:
-    """Boards of pipelines and of the program have no figures and no pictures: for tests that are about rows."""
+    """Boards of pipelines and of the program have no figures and no pictures: for modules that are about rows."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("figures_extra", "pictures_extra"):
-            patch.setattr(build, name, lambda *_, **__: AdditionalFiles())
+        _leave_undrawn(patch)
         yield
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same for one test, where others of its module are about figures or pictures."""
+    _leave_undrawn(monkeypatch)
 
 
 @pytest.fixture(scope="module")

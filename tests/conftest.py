@@ -58,7 +58,6 @@ LOOPBACK = ("127.", "localhost", "::1")
 
 def pytest_collection_finish() -> None:
     """Collect garbage seldom, and never what is there for good: thousands of tests, and the modules they import."""
-    gc.collect()
     gc.freeze()
     gc.enable()
     gc.set_threshold(10_000, 10, 50)  # tables and figures make many objects that die without it

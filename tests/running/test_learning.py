@@ -186,6 +186,7 @@ def test_what_cannot_be_kept_is_nothing_that_was_learnt(learned, fault):
 # --- the training set -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_nobody_learns_from_what_is_asked(request_of, tasks):
     absent = tasks / "tasks" / "absent" / "town-riverside"
     with pytest.raises(

@@ -31,6 +31,7 @@ from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.testing import TinyPlace, tiny_place
 from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.threaded import threaded
 
@@ -305,6 +306,16 @@ def few_controls() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline_plan, "CONTROL_REGIONS", ("town-suburb",))
         patch.setattr(pipeline_plan, "CONTROL_SITES", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def small_flight_views() -> Iterator[None]:
+    """Views of flights are a ninth of their size, which most of the drawing takes: for tests of ways and of answers."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, suite in FLIGHT_SUITES.items():
+            views = tuple(replace(item, view_cells=64) for item in suite.variants)
+            patch.setitem(EVERY_SUITE, name, replace(suite, variants=views))
         yield
 
 

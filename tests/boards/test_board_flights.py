@@ -28,6 +28,8 @@ from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.browser import PATIENCE_S, browser, find_chromium
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 SUITE, REGION = "flight-overconfident", "town-riverside"
 HASH = "0" * 12
 SURE = (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0, 0.0, 4.0)

@@ -19,6 +19,8 @@ from sasgeo_bench.tasks.query import flight_id
 from tests.slow import rest_slow
 from tests.world import drawn
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 TOWN = "town-riverside"
 PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
 

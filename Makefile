@@ -77,9 +77,6 @@ test test-of test-quick test-torch test-oldest test-wheel: export PYTHONDONTWRIT
 # The workers fill the processors already: threads of linear algebra and of image warps would wait for each other.
 test test-of test-quick test-torch test-oldest test-wheel: export OMP_NUM_THREADS := 1
 test test-of test-quick test-torch test-oldest test-wheel: export OPENCV_FOR_THREADS_NUM := 1
-# Arrays come and go by thousands: the C library keeps their memory, else the kernel clears each page anew.
-test test-of test-quick test-torch test-oldest test-wheel: export MALLOC_MMAP_THRESHOLD_ := 33554432
-test test-of test-quick test-torch test-oldest test-wheel: export MALLOC_TRIM_THRESHOLD_ := 1073741824
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 3 --dist loadfile -p no:benchmark -rs $(ARGS)

@@ -31,6 +31,7 @@ from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.testing import TinyPlace, tiny_place
 from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.threaded import threaded
 
@@ -49,6 +50,7 @@ settings.register_profile("search", settings.get_profile("sasgeo"), derandomize=
 settings.load_profile("sasgeo")
 gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of that time
 os.environ["SASGEO_KEPT_MB"] = "0"  # no test reads or writes what the user keeps of maps (tests/running/test_kept.py)
+os.fsync = lambda _: None  # what a test wrote need not outlive a power cut: none waits for the disk
 progress.EVERY_S = math.inf  # else lines of progress come between others wherever the machine is slow
 
 BUILDERS = ("test_build.py", "test_cli.py", "test_results.py", "test_town.py")  # build or start something in each test
@@ -57,7 +59,6 @@ LOOPBACK = ("127.", "localhost", "::1")
 
 def pytest_collection_finish() -> None:
     """Collect garbage seldom, and never what is there for good: thousands of tests, and the modules they import."""
-    gc.collect()
     gc.freeze()
     gc.enable()
     gc.set_threshold(10_000, 10, 50)  # tables and figures make many objects that die without it
@@ -244,13 +245,23 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "_found", found)
 
 
+def _leave_undrawn(patch: pytest.MonkeyPatch) -> None:
+    for name in ("figures_extra", "pictures_extra"):
+        patch.setattr(build, name, lambda *_, **__: AdditionalFiles())
+
+
 @pytest.fixture(scope="module")
 def without_drawings() -> Iterator[None]:
-    """Boards of pipelines and of the program have no figures and no pictures: for tests that are about rows."""
+    """Boards of pipelines and of the program have no figures and no pictures: for modules that are about rows."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("figures_extra", "pictures_extra"):
-            patch.setattr(build, name, lambda *_, **__: AdditionalFiles())
+        _leave_undrawn(patch)
         yield
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same for one test, where others of its module are about figures or pictures."""
+    _leave_undrawn(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -295,6 +306,16 @@ def few_controls() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline_plan, "CONTROL_REGIONS", ("town-suburb",))
         patch.setattr(pipeline_plan, "CONTROL_SITES", 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def small_flight_views() -> Iterator[None]:
+    """Views of flights are a ninth of their size, which most of the drawing takes: for tests of ways and of answers."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, suite in FLIGHT_SUITES.items():
+            views = tuple(replace(item, view_cells=64) for item in suite.variants)
+            patch.setitem(EVERY_SUITE, name, replace(suite, variants=views))
         yield
 
 

@@ -93,8 +93,7 @@ def test_every_python_file_begins_with_its_licence_and_a_docstring() -> None:
     wrong = []
     for path in python_files():
         text = path.read_text(encoding="utf-8")
-        is_licensed = text.startswith("# SPDX-License-Identifier: Apache-2.0\n")
-        if not is_licensed or not ast.get_docstring(ast.parse(text)):
+        if not re.match(r'# SPDX-License-Identifier: Apache-2\.0\n(#.*\n|\n)*r?"""[^"\s]', text):
             wrong.append(str(path.relative_to(ROOT)))
     assert wrong == []
     assert len(python_files()) > 5

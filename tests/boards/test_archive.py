@@ -76,13 +76,6 @@ def kept(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     return board, plan, out / "results" / "kept", lines
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Boards of stored results have no figures and no pictures: for tests that are about their tables."""
-    for name in ("figures_extra", "pictures_extra"):
-        monkeypatch.setattr(build, name, lambda *_, **__: AdditionalFiles())
-
-
 def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path):
     _, plan, folder, _ = kept
     code, _, err = program("score", "--predictions", folder, "--truth", folder, "--name", "again", "--out", tmp_path)

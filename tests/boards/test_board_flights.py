@@ -28,6 +28,8 @@ from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.browser import PATIENCE_S, browser, find_chromium
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 SUITE, REGION = "flight-overconfident", "town-riverside"
 HASH = "0" * 12
 SURE = (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0, 0.0, 4.0)
@@ -127,6 +129,7 @@ def test_the_page_of_a_suite_has_its_table_figures_and_flight(out):
         assert shown in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_stored_results_give_the_same_board(out):
     again = score(predictions=out / "results" / "mine", out=out, name="again", draws=100, cases=False)
     first, second = (
@@ -143,7 +146,7 @@ ASKED = {
 }
 
 
-@pytest.mark.usefixtures("plain_site")
+@pytest.mark.usefixtures("undrawn", "plain_site")
 def test_limits_and_requirements_are_on_the_board_its_page_and_on_stored_results_scored_again(out, tmp_path, capsys):
     results = tmp_path / "results"
     board = score(predictions=out / "runs", out=out, name="asked", draws=100, cases=False, results=results, **ASKED)

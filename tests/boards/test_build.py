@@ -284,6 +284,7 @@ def test_no_figure_hangs_on_how_many_processes_judge(out, tmp_path, split):
     assert one.board.about.remarks == two.board.about.remarks
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_rejector_that_is_not_applied_says_why(out, split):
     lines = []
     run(plan_run(RunRequest(spec="random", tasks=[out / "tasks" / "clean" / TOWNS[0]], out=out)))
@@ -748,6 +749,7 @@ def test_a_board_may_not_be_named_like_a_path(out, monkeypatch, capsys):
     assert "--name must hold letters" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_control_that_fails_is_told_first_and_ends_with_its_own_status(out, monkeypatch, capsys):
     verdict = Verdict(
         control="shuffled map at chance", matcher="random", n=8, found=8.0, expected=0.8, p=1e-8, holds=False
@@ -766,6 +768,7 @@ def test_a_control_that_fails_is_told_first_and_ends_with_its_own_status(out, mo
     assert text.index("CONTROLS FAILED") < text.index("## ")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_rival_that_knows_too_much_is_set_apart_and_the_board_stands(out, tmp_path, monkeypatch, program):
     submission(out, tmp_path / "mine.parquet")
     chance = {"n": 8, "found": 8.0, "expected": 0.8, "p": 1e-8}
@@ -978,6 +981,7 @@ def test_a_rejector_that_fails_with_one_judges_the_others(out, both, split):
         board_of(out, both[1], **asked | {"contrasts": []})
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_program_says_who_failed_and_ends_with_a_status_of_its_own(out, both, program):
     rewrite(both[1], "latency_s", math.inf)
     words = ("--out", out, "--name", "mine", "--draws", "200", "--no-cases")

@@ -17,6 +17,8 @@ from sasgeo_bench.tasks.task_files import Task
 from tests.flights.autopilots import Flown, fusing, px4_drift, tlog, ulog, write
 from tests.tasks.test_flown import Logged
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 
 @pytest.fixture
 def pairs(tmp_path):

@@ -11,6 +11,8 @@ from tests.observing.flown import answer, flights_of, run_of
 from tests.observing.listening import Listener, silence
 from tests.world import drawn
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 TOWN = "town-grid"
 START = ("--start", "2026-05-01T12:00:00+02:00")
 

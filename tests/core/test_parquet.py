@@ -159,16 +159,16 @@ def test_no_other_file_of_the_package_writes_or_reads_parquet() -> None:
 
 LONG = "x" * 10_000
 BOMBS = {
-    "texts": pa.array([LONG] * 1000),
-    "bytes": pa.array([LONG.encode()] * 1000),
-    "large texts": pa.array([LONG] * 1000, pa.large_string()),
-    "in lists": pa.array([[LONG] * 10] * 100),
-    "in lists of lists": pa.array([[[LONG] * 10] * 10] * 10),
-    "in records": pa.array([{"a": 1, "b": LONG}] * 1000),
-    "names in maps": pa.array([[(LONG, 1.0)]] * 1000, pa.map_(pa.string(), pa.float64())),
-    "values in maps": pa.array([[("a", LONG)]] * 1000, pa.map_(pa.string(), pa.string())),
-    "of fixed length": pa.array([LONG.encode()] * 1000, pa.binary(10_000)),
-    "behind others": pa.array([*("y" * 10 for _ in range(1000)), *([LONG] * 1000), None]),
+    "texts": lambda: pa.array([LONG] * 1000),
+    "bytes": lambda: pa.array([LONG.encode()] * 1000),
+    "large texts": lambda: pa.array([LONG] * 1000, pa.large_string()),
+    "in lists": lambda: pa.array([[LONG] * 10] * 100),
+    "in lists of lists": lambda: pa.array([[[LONG] * 10] * 10] * 10),
+    "in records": lambda: pa.array([{"a": 1, "b": LONG}] * 1000),
+    "names in maps": lambda: pa.array([[(LONG, 1.0)]] * 1000, pa.map_(pa.string(), pa.float64())),
+    "values in maps": lambda: pa.array([[("a", LONG)]] * 1000, pa.map_(pa.string(), pa.string())),
+    "of fixed length": lambda: pa.array([LONG.encode()] * 1000, pa.binary(10_000)),
+    "behind others": lambda: pa.array([*("y" * 10 for _ in range(1000)), *([LONG] * 1000), None]),
 }
 
 
@@ -176,15 +176,15 @@ BOMBS = {
 @pytest.mark.parametrize("rows", [7, None], ids=["in groups", "at once"])
 def test_one_long_text_in_many_rows_is_refused_before_it_is_unpacked(kind, rows, tmp_path, monkeypatch):
     monkeypatch.setattr(parquet, "_MOST_UNPACKED", 10**6)
-    path = tmp_path / "a.parquet"
-    pq.write_table(pa.table({"n": range(len(BOMBS[kind])), "a": BOMBS[kind]}), path, row_group_size=rows)
+    path, texts = tmp_path / "a.parquet", BOMBS[kind]()
+    pq.write_table(pa.table({"n": range(len(texts)), "a": texts}), path, row_group_size=rows)
     assert path.stat().st_size < 10**6
     with pytest.raises(StoreError, match="bytes unpacked") as caught:
         read_table(path, mend=MEND)
     assert str(caught.value).endswith(MEND)
     fewer = tmp_path / "b.parquet"
-    pq.write_table(pa.table({"a": BOMBS[kind][:1]}), fewer, row_group_size=rows)
-    assert read_table(fewer, mend=MEND)["a"].to_pylist() == BOMBS[kind][:1].to_pylist()
+    pq.write_table(pa.table({"a": texts[:1]}), fewer, row_group_size=rows)
+    assert read_table(fewer, mend=MEND)["a"].to_pylist() == texts[:1].to_pylist()
 
 
 def test_no_text_is_longer_than_a_bound(tmp_path, monkeypatch):

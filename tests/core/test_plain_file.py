@@ -28,6 +28,7 @@ from sasgeo_bench.sensing.photos import read_photo
 CODE = Path(sasgeo_bench.__file__).parent
 READS = {"read_bytes", "read_text"}
 OPENERS = {"rasterio.open", "Image.open", "tarfile.open", "gzip.open", "pq.ParquetFile", "np.load", "open_memmap"}
+NAMES = {"open", *READS, *(name.rpartition(".")[2] for name in OPENERS)}
 # Files of the kernel; and reads of what ships with the package, or what the same function has just written.
 APART = {f"running/{name}.py" for name in ("kernel", "memory", "sandbox", "sensors")}
 OWN = {
@@ -121,7 +122,7 @@ def unguarded(path: Path) -> Iterator[str]:
     """Reads of a file that do not go through `plain_file`, as `file:line: code`."""
     file = path.relative_to(CODE).as_posix()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute) or node.func.attr not in NAMES:
             continue
         called, text = ast.unparse(node.func), ast.unparse(node)
         modes = {item.value for item in node.args if isinstance(item, ast.Constant)}

@@ -8,9 +8,10 @@ import sqlite3
 import struct
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pytest
@@ -149,6 +150,16 @@ def dumped(path: Path, *types: str) -> str:
     return ran(sys.executable, TOOLS / "mavlogdump.py", "--format", "csv", "--types", ",".join(types), path)
 
 
+def messages_dumped(path: Path, names: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
+    """What mavlogdump prints of messages, by their name: its JSON holds those of several, and lists as they are."""
+    words = (sys.executable, TOOLS / "mavlogdump.py", "--format", "json", "--types", ",".join(names), path)
+    found: dict[str, list[dict[str, Any]]] = {}
+    for line in ran(*words).splitlines():
+        row = json.loads(line)
+        found.setdefault(row["meta"]["type"], []).append(row)
+    return found
+
+
 def _ardupilot() -> dict[str, list[tuple]]:
     """All messages that are read of a DataFlash log, with numbers of their own in every column."""
     rows = ardupilot_rows(FLOWN)
@@ -160,16 +171,20 @@ def _ardupilot() -> dict[str, list[tuple]]:
     return rows
 
 
+OF_DATAFLASH = ("GPS", "GPA", "POS", "ATT", "XKF1", "XKF4", "VISP")
+
+
 @pytest.mark.parametrize(("file", "lay"), [("a.bin", dataflash), ("a.log", dataflash_text)])
-@pytest.mark.parametrize("name", ["GPS", "GPA", "POS", "ATT", "XKF1", "XKF4", "VISP"])
-def test_each_column_of_dataflash_is_what_mavlogdump_prints(tmp_path: Path, name: str, file: str, lay) -> None:
+def test_each_column_of_dataflash_is_what_mavlogdump_prints(tmp_path: Path, file: str, lay) -> None:
     pytest.importorskip("pymavlink", reason="needs the extra [logs]")
     path = write(tmp_path / file, lay(_ardupilot()))
-    table = table_of(dumped(path, name))
-    columns = read_messages(path, [name]).messages[name]
-    assert set(table) - {"timestamp"} == set(columns)
-    for column, values in columns.items():
-        assert values == pytest.approx(table[column], rel=1e-6), column
+    printed, messages = messages_dumped(path, OF_DATAFLASH), read_messages(path, OF_DATAFLASH).messages
+    assert set(printed) == set(messages) == set(OF_DATAFLASH)
+    for name, columns in messages.items():
+        assert {column for row in printed[name] for column in row["data"]} == set(columns), name
+        for column, values in columns.items():
+            expected = [float(row["data"][column]) for row in printed[name]]
+            assert values == pytest.approx(expected, rel=1e-6), (name, column)
 
 
 def _telemetry() -> bytes:
@@ -195,22 +210,20 @@ def _telemetry() -> bytes:
     return packets
 
 
-@pytest.mark.parametrize("name", FIELDS)
-def test_each_column_of_telemetry_is_what_mavlogdump_prints(tmp_path: Path, name: str) -> None:
+def test_each_column_of_telemetry_is_what_mavlogdump_prints(tmp_path: Path) -> None:
     pytest.importorskip("pymavlink", reason="needs the extra [logs]")
     path = write(tmp_path / "a.tlog", _telemetry())
-    read = read_telemetry(path)
-    columns = read.messages.get(name) or read.odometry[name, 197]
-    # its CSV does not quote lists
-    words = (sys.executable, TOOLS / "mavlogdump.py", "--format", "json", "--types", name, path)
-    rows = [json.loads(line) for line in ran(*words).splitlines()]
-    assert len(rows) == len(columns["received"]) == len(FLOWN.time_s)
-    assert columns["received"] == pytest.approx([row["meta"]["timestamp"] for row in rows], abs=1e-5)
-    for column in FIELDS[name]:
-        title, _, at = column.rstrip("]").partition("[")
-        cells = [row["data"][title] for row in rows]
-        values = [float(cell[int(at)] if at else cell) for cell in cells]
-        assert columns[column] == pytest.approx(values, rel=1e-6), column
+    read, printed = read_telemetry(path), messages_dumped(path, tuple(FIELDS))
+    assert set(printed) == set(FIELDS)
+    for name, rows in printed.items():
+        columns = read.messages.get(name) or read.odometry[name, 197]
+        assert len(rows) == len(columns["received"]) == len(FLOWN.time_s), name
+        assert columns["received"] == pytest.approx([row["meta"]["timestamp"] for row in rows], abs=1e-5), name
+        for column in FIELDS[name]:
+            title, _, at = column.rstrip("]").partition("[")
+            cells = [row["data"][title] for row in rows]
+            values = [float(cell[int(at)] if at else cell) for cell in cells]
+            assert columns[column] == pytest.approx(values, rel=1e-6), (name, column)
 
 
 # Message, its file; the places in it: degrees of a DataFlash log, counts of 1e-7 degrees of telemetry.

@@ -18,6 +18,8 @@ from sasgeo_bench.tasks.task_files import Task
 from tests.observing.flown import SPREAD, answer, flights_of, run_of
 from tests.world import drawn
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 TOWN = "town-grid"
 
 

@@ -128,16 +128,20 @@ def test_what_was_learnt_is_used_again_and_learnt_anew_from_something_else(reque
         ("LearnsBytes", "invalid", "while learning: learn() returned bytes, expected a text"),
     ],
 )
-def test_whoever_fails_to_learn_loses_its_rows_and_nothing_else(request_of, name, status, words):
-    limits = replace(PATIENT, learn_s=1.0) if name == "HangsInLearn" else PATIENT
-    request = request_of(name, limits=limits)
-    _, report, folder = carry_out(request)
+def test_whoever_fails_to_learn_loses_its_rows_and_nothing_else(request_of, request, name, status, words):
+    limits = PATIENT
+    if name == "HangsInLearn":  # which a process alone can be ended for
+        limits = replace(PATIENT, learn_s=1.0)
+    else:
+        request.getfixturevalue("in_threads")
+    asked = request_of(name, limits=limits)
+    _, report, folder = carry_out(asked)
     assert report.counts == {status: 2}
     assert report.messages[status].startswith(words)
     assert RunManifest.open(folder).learned.file is None
-    assert {item.status for item in answers(request, folder).values()} == {status}
-    assert plan_run(request).parts[0].left == ()  # asked and answered, if badly: --again asks once more
-    assert len(plan_run(replace(request, again=(status,))).parts[0].left) == 2
+    assert {item.status for item in answers(asked, folder).values()} == {status}
+    assert plan_run(asked).parts[0].left == ()  # asked and answered, if badly: --again asks once more
+    assert len(plan_run(replace(asked, again=(status,))).parts[0].left) == 2
 
 
 @pytest.mark.usefixtures("in_threads")
@@ -182,6 +186,7 @@ def test_what_cannot_be_kept_is_nothing_that_was_learnt(learned, fault):
 # --- the training set -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_nobody_learns_from_what_is_asked(request_of, tasks):
     absent = tasks / "tasks" / "absent" / "town-riverside"
     with pytest.raises(

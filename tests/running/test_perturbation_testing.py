@@ -10,8 +10,15 @@ import pytest
 import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.matching.scaffold import package_files, write_plugin
+from sasgeo_bench.running import perturbation_testing
 from sasgeo_bench.running.perturbation_testing import check_perturbation
 from tests.slow import rest_slow
+
+
+@pytest.fixture
+def one_town(tiny, monkeypatch):
+    """The kit looks at views of a town that is there already."""
+    monkeypatch.setattr(perturbation_testing, "tiny_place", lambda _: tiny)
 
 
 @dataclass(frozen=True)
@@ -108,6 +115,7 @@ class Stumbles(Stripes):
         super().__post_init__()
 
 
+@pytest.mark.usefixtures("one_town")
 @pytest.mark.parametrize(
     ("rule", "one"),
     [
@@ -131,6 +139,7 @@ def test_a_perturbation_that_breaks_a_rule_fails_there(named, tmp_path, rule, on
     assert all("\n" not in row.found for row in rows)
 
 
+@pytest.mark.usefixtures("one_town")
 @pytest.mark.parametrize(
     "one", rest_slow([Stripes, OwnStreams, Stripes(share=0.5), lambda strength: Stripes(share=strength)], but=2)
 )
@@ -138,6 +147,7 @@ def test_a_sound_class_instance_or_function_of_a_strength_keeps_every_rule(named
     assert [row for row in check_perturbation(named(one), out=tmp_path) if row.outcome != "pass"] == []
 
 
+@pytest.mark.usefixtures("one_town")
 @pytest.mark.parametrize(
     ("given", "expected"),
     [

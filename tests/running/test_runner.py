@@ -273,6 +273,7 @@ def test_rows_of_an_older_program_are_taken_for_the_task_that_its_run_json_names
         plan_run(request_of(task, tmp_path, limit=2))
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_another_version_of_a_matcher_has_a_folder_of_its_own(place, task, tmp_path):
     first = plan_run(request_of(task, tmp_path)).parts[0].folder
     source = place / "hostile.py"
@@ -317,6 +318,7 @@ def test_hostile_matchers_cost_their_own_rows_from_the_run_to_the_board(task, un
         assert answered[name][status] == 2
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_mistake_of_ours_about_one_answer_costs_its_row_and_the_log_says_where(task, tmp_path, monkeypatch):
     work, count = answers.check_prediction, iter(range(100))
 

@@ -174,6 +174,7 @@ def test_a_segmenter_that_learns_sees_no_labels_but_those_it_learns_from(request
     assert train_segmenter(request_of("CountsLabels", is_sandboxed=False), own).learned == "12 beside 4"
 
 
+@pytest.mark.usefixtures("in_threads")
 @pytest.mark.parametrize(
     ("name", "words"),
     [

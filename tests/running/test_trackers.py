@@ -19,6 +19,8 @@ from sasgeo_bench.tasks.query import flight_id
 from tests.slow import rest_slow
 from tests.world import drawn
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 TOWN = "town-riverside"
 PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
 
@@ -154,6 +156,7 @@ def test_a_flight_that_was_cut_off_is_asked_from_its_first_view(task, tmp_path):
     assert all(views_of(rows) == list(range(1, len(rows) + 1)) for rows in flights.values())
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_shards_hold_whole_flights_and_all_of_them(task, tmp_path):
     request = RunRequest(spec="dead_reckoning", tasks=(task,), out=tmp_path, limits=PATIENT)
     parts = [plan_run(replace(request, shard=(number, 2))).parts[0].left for number in (1, 2)]

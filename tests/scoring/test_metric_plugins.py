@@ -5,6 +5,8 @@ import dataclasses
 import math
 import re
 import sys
+import tempfile
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 
 import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import ConfigError, MatchError, MetricError
+from sasgeo_bench.scoring import metric_testing
 from sasgeo_bench.scoring.metric_plugins import ForeignMetric, find_metric, find_metrics, with_metrics
 from sasgeo_bench.scoring.metric_testing import check_metric, metric_files
 from sasgeo_bench.scoring.metrics import means_of
@@ -36,6 +39,19 @@ def metric(values=near, **changes):
 
 def foreign(*metrics):
     return [ForeignMetric(f"mine:{at}", one, "0" * 64) for at, one in enumerate(metrics)]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _worked_once():
+    """The kit's answers on its small towns are worked once: each metric is asked about copies of the same rows."""
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        worked = cache(partial(metric_testing.worked_answers, Path(folder)))
+
+        def copies(_, track):
+            return {name: rows.copy() for name, rows in worked(track).items()}
+
+        patch.setattr(metric_testing, "worked_answers", copies)
+        yield
 
 
 class Untold:

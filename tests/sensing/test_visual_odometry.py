@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -20,15 +21,13 @@ LENS = Intrinsics(
 )
 
 
+@cache
 def texture(seed):
     """Return ground of 250 m a side as grey texels, north up, its middle at (0, 0)."""
     rng = np.random.default_rng(seed)
     layers = [cv2.GaussianBlur(rng.standard_normal((2000, 2000)), (0, 0), sigma) * sigma for sigma in (1.5, 4.0, 12.0)]
     grey = cv2.normalize(sum(layers), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=2)
-
-
-GROUND = texture(1)
 
 
 def picture(stand, ground=None):
@@ -46,7 +45,7 @@ def picture(stand, ground=None):
         np.column_stack([axes[:, 0], axes[:, 1], -axes @ centre])
     )
     m_of_texel = np.array([[TEXEL_M, 0, -999.5 * TEXEL_M], [0, -TEXEL_M, 999.5 * TEXEL_M], [0, 0, 1]])
-    shown = GROUND if ground is None else ground
+    shown = texture(1) if ground is None else ground
     return cv2.warpPerspective(shown, pixel_of_m @ m_of_texel, (SIDE_PX, SIDE_PX), flags=cv2.INTER_LINEAR)
 
 

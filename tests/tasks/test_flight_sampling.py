@@ -34,6 +34,8 @@ from sasgeo_bench.tasks.task_files import (
 from sasgeo_bench.tasks.task_plan import TaskRequest, plan_requests
 from tests.tasks.test_task_files import ABOUT, one_query, one_truth
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 TOWN = "town-grid"
 REACH_M = 144.0
 

@@ -24,6 +24,8 @@ from tests.tasks.test_task_plan import own_region
 
 TOWN = "town-grid"
 
+pytestmark = pytest.mark.usefixtures("small_flight_views")
+
 
 @pytest.fixture
 def root(lay_towns, tmp_path):

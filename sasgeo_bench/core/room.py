@@ -24,16 +24,18 @@ from sasgeo_bench.core.progress import tell
 VARIABLE: Final = "SASGEO_KEPT_MB"  # most megabytes that are kept; 0 keeps nothing
 MOST_MB: Final = 4000
 _ABOUT: Final = "kept.json"  # of a folder, written last: sizes of the other files
-_LEFT_S: Final = 86_400  # nothing is made for a day: what is older was left by a process that was killed
+_LEFT_S: Final = 3600  # nothing is made for an hour: what is older was left by a process that was killed
+_DIGITS: Final = 12  # of a number of megabytes: Python reads no endless ones
 
 
 def cache_home() -> Path:
     """Return the program's folder in the user's cache (`XDG_CACHE_HOME`); raise `StoreError` if the user has none."""
-    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    try:
-        return (named if named.is_absolute() else Path.home() / ".cache") / "sasgeo-bench"
-    except RuntimeError as error:  # of a user who is only a number, as in containers
-        raise StoreError("you have no home, and so no cache: name a folder by XDG_CACHE_HOME") from error
+    cache_home = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    with suppress(RuntimeError):  # of a user who is only a number, as in containers
+        cache_home = cache_home if cache_home.is_absolute() else Path.home() / ".cache"
+    if not cache_home.is_absolute():  # a home may be anything, too
+        raise StoreError("you have no home, and so no cache: name a folder by XDG_CACHE_HOME")
+    return cache_home / "sasgeo-bench"
 
 
 class Entry(NamedTuple):
@@ -75,7 +77,7 @@ class Room:
 
     def make(self, needed: int) -> None:
         """Remove what was not asked for longest, until so many bytes fit; raise `StoreError` if they cannot."""
-        for left in (*self.maps.glob("*/.*"), *self.fits.glob(".*")):
+        for left in (*self.maps.glob(".*"), *self.maps.glob("*/.*"), *self.fits.glob(".*")):
             with suppress(OSError):
                 if left.stat().st_mtime < time.time() - _LEFT_S:
                     _remove(left)
@@ -87,9 +89,11 @@ class Room:
             if total + needed <= most_bytes():
                 break
             _remove(entry.path)
-            total -= entry.size
+            total -= 0 if os.path.lexists(entry.path) else entry.size
             with suppress(OSError):
                 entry.path.parent.rmdir()  # of a map of which nothing is kept any more
+        if total + needed > most_bytes():
+            raise StoreError(f"{self.root} holds what cannot be removed, and more than {VARIABLE} allows")
         self.root.mkdir(parents=True, exist_ok=True)
         if shutil.disk_usage(self.root).free < 2 * needed:
             raise StoreError(f"{self.root} has too little free space")
@@ -108,9 +112,10 @@ def most_bytes() -> int:
 
 @cache
 def _most_mb(text: str) -> int:
-    if text and not text.isdecimal():
-        tell(f"{VARIABLE} is {text!r}, no whole number of megabytes: {MOST_MB} are kept at most")
-    return int(text) if text.isdecimal() else MOST_MB
+    is_number = text.isdecimal() and len(text) <= _DIGITS
+    if text and not is_number:
+        tell(f"{VARIABLE} is {text[:40]!r}, no whole number of megabytes: {MOST_MB} are kept at most")
+    return int(text) if is_number else MOST_MB
 
 
 def seal(folder: Path) -> None:

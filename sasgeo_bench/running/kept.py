@@ -88,10 +88,13 @@ def order(region: Path, wanted: Sequence[Mapping[str, Any]]) -> None:
     region : Path
         Folder of the map.
     wanted : sequence of mapping
-        Arguments of `kept_of`: `what`, `settings` and `digest`.
+        Arguments of `kept_of`: `what`, `settings` and `digest`; those of another map are left out.
     """
     shelf = shelf_of(region) if wanted else None
-    if shelf is not None and os.access(shelf, os.W_OK):
+    if shelf is None:
+        return
+    wanted = [one for one in wanted if one["digest"] == shelf.name]
+    if wanted and os.access(shelf, os.W_OK):
         if _BEGUN.acquire(blocking=False):
             threading.Thread(target=_serve, daemon=True).start()
         _ORDERS.put((region.resolve(), [{**one, "folder": str(shelf / _name_of(**one))} for one in wanted]))

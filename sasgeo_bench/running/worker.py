@@ -2,6 +2,7 @@
 """Start, ask, watch and end the process of a plugin; that of a matcher."""
 
 import contextlib
+import json
 import os
 import secrets
 import signal
@@ -168,6 +169,7 @@ class _Wants(StrictModel):
 
 _WANTED: Final = TypeAdapter(_Wants)
 _MOST_WANTED: Final = 8  # by one question
+_MOST_SETTINGS: Final = 2**16  # characters of each, ten times those of a trained map
 _FAILED: Final = TypeAdapter(_Failed)
 _SOUND: Final = TypeAdapter(_Sound)
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
@@ -419,7 +421,7 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         found = scan.hidden([*code, *self.reach.readable])
         packed = sorted(shipped_dir("pipelines").glob(f"*{PACKED}"))  # answers; what is installed is not walked
         hidden = [*map(str, (*self.reach.hidden, *packed)), *(path for path in found if not self._is_lesson(path))]
-        hidden += _open_cache(code)
+        hidden += _open_cache([*code, *self.reach.readable])
         return sandbox.Policy(
             readable=[str(path) for path in (*code, *self.reach.readable)],
             scratch=scratch,
@@ -486,8 +488,9 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, given the learned text."""
+        is_again = (region, learned) == (self._region, self._learned)
         self._region, self._learned = region, learned
-        self._is_kept, self._missed = _shelf(region) is not None, []
+        self._is_kept, self._missed = self._shelf(region) is not None, []
         reply = self._ask(
             "prepare",
             timeout_s=self.limits.prepare_s,
@@ -496,7 +499,8 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
             learned=learned,
             is_kept=self._is_kept,
         )
-        order(region, self._missed)  # now that the matcher has made its own, so that it waits for nothing
+        if not is_again:  # else a matcher that ends at each query has something new made each time
+            order(region, self._missed)  # now that the matcher has made its own, so that it waits for nothing
         if reply.status != "ok":
             self.end()
         return reply
@@ -529,6 +533,8 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
         if not self._is_kept or self._seen == self.starts:  # settings could tell its next process what it saw
             return {"folder": None}
         missed = wants.wanted.model_dump()
+        if len(json.dumps(missed)) > _MOST_SETTINGS:
+            raise MatchError(f"settings of what is kept have more than {_MOST_SETTINGS} characters")
         folder = kept_of(self._region, **missed)
         if folder is None:
             self._missed.append(missed)
@@ -536,8 +542,12 @@ class Worker(PluginProcess[MatcherCard, Prediction]):
 
     def _policy(self, scratch: str) -> sandbox.Policy:
         """Let it read what is kept of its maps, too."""
-        policy, shelves = super()._policy(scratch), filter(None, map(_shelf, self.reach.readable))
+        policy, shelves = super()._policy(scratch), filter(None, map(self._shelf, self.reach.readable))
         return replace(policy, readable=[*policy.readable, *map(str, shelves)])
+
+    def _shelf(self, region: Path) -> Path | None:
+        """Return the folder of what is kept of a map; None where others could be read beside it."""
+        return None if _open_cache([*_code(), *self.reach.readable]) else shelf_of(region)
 
     def _found(self, data: bytes) -> Prediction:
         return check_prediction(checked(ROW, data), None, top_k=MOST_CANDIDATES)
@@ -598,17 +608,12 @@ def _command(channel: int, *, is_sandboxed: bool) -> list[str]:
     return [sys.executable, "-I", "-S", "-c", PROGRAM, package, *_ANSWERS, str(channel)]
 
 
-def _shelf(region: Path) -> Path | None:
-    """Return the folder of what is kept of a map; None where others could be read beside it."""
-    return None if _open_cache(_code()) else shelf_of(region)
-
-
-def _open_cache(code: Sequence[Path]) -> list[str]:
+def _open_cache(read: Sequence[Path]) -> list[str]:
     """Return the parts of the user's cache that lie where plugins read, as where their home is the working folder."""
     with contextlib.suppress(StoreError):
         room = Room.of_user()
         parts = [os.path.realpath(path) for path in (room.maps, room.fits)]
-        around = [os.path.realpath(path) for path in (*map(str, code), *sandbox.SYSTEM)]
+        around = [os.path.realpath(path) for path in (*map(str, read), *sandbox.SYSTEM)]
         return [part for part in parts if any(Path(part).is_relative_to(path) for path in around)]
     return []
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is kept of a map is what would be made, of this map and these settings; and no plugin can change it."""
 
+import io
 import json
 import os
 import pwd
@@ -18,13 +19,14 @@ import pytest
 from sasgeo_bench.boards.archive import fits_folder
 from sasgeo_bench.cli.doctor import examine
 from sasgeo_bench.core import room
-from sasgeo_bench.core.errors import StoreError
+from sasgeo_bench.core.errors import MatchError, StoreError
 from sasgeo_bench.core.folders import remove_tree
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running import keeper, kept, sandbox, worker
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.raster import likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.rates import FAR
 from sasgeo_bench.sasgeo.weights import STRATA
 from sasgeo_bench.search.stored import FACTORS
 from sasgeo_bench.search.view import Chart
@@ -181,6 +183,19 @@ def test_a_matcher_makes_what_was_removed_meanwhile(place, task):
     assert read_field(region, likeness_by_hand(region.classes)).known.any()
 
 
+def test_a_matcher_makes_what_was_overwritten(place, task, here):
+    found = keeping(town_of(place, task))
+    makers = [Chart.of, MappedGraph.of, lambda region: read_field(region, likeness_by_hand(region.classes))]
+    for make in makers:
+        make(found)
+    assert len(here) == len(makers)
+    for path in kept.shelf_of(town_of(place, task)).glob("*/*[ny]"):  # arrays and levels.json
+        if path.name != "kept.json":
+            path.write_bytes(bytes(path.stat().st_size))
+    for make in makers:
+        assert make(found).known.any()
+
+
 def test_a_part_of_a_map_is_not_taken_for_the_whole(place, task):
     region = read_region(town_of(place, task), with_layers=False)
     vars(region)["keep"] = pytest.fail
@@ -212,12 +227,15 @@ def test_without_a_folder_that_can_be_written_nothing_is_kept(place, task, here,
     assert here == []
 
 
-@pytest.mark.parametrize("fault", ["no home", "a circle"])
+@pytest.mark.parametrize("fault", ["no home", "a home that is no path", "a circle"])
 def test_without_a_cache_nothing_is_kept(fault, place, task, here, tmp_path, monkeypatch):
     if fault == "no home":  # as of a user who is only a number, in a container
         monkeypatch.delenv("XDG_CACHE_HOME")
         monkeypatch.delenv("HOME")
         monkeypatch.setattr(pwd, "getpwuid", {}.__getitem__)
+    elif fault == "a home that is no path":
+        monkeypatch.setenv("XDG_CACHE_HOME", "beside")
+        monkeypatch.setenv("HOME", "mine")
     else:
         (tmp_path / "one").symlink_to("two")
         (tmp_path / "two").symlink_to("one")
@@ -225,7 +243,7 @@ def test_without_a_cache_nothing_is_kept(fault, place, task, here, tmp_path, mon
     region = town_of(place, task)
     assert (kept.shelf_of(region), asked(region, "graph"), here) == (None, None, [])
     assert replies(place, task, "graph_only")[1].status == "ok"
-    assert (fits_folder() is None) == (fault == "no home")
+    assert (fits_folder() is None) == (fault != "a circle")
     (words,) = [words for what, words in examine([], out=tmp_path) if what == "kept of maps and answers"]
     assert fault == "a circle" or words.endswith("name a folder by XDG_CACHE_HOME")
 
@@ -278,18 +296,25 @@ def of_python(program, **more):
     return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, **more)  # noqa: S603
 
 
-def test_a_maker_that_is_stopped_leaves_nothing_and_says_why(place, task, shelf):
+@pytest.mark.parametrize("number", ["SIGALRM", "SIGINT", "SIGHUP"])
+@pytest.mark.parametrize("is_swallowed", [False, True])
+def test_a_maker_that_is_stopped_leaves_nothing_and_says_why(number, is_swallowed, place, task, shelf):
     """As one that takes too long is by itself, and one of an interrupted command by the terminal."""
     region = town_of(place, task)
     wanted = {"what": "graph", "settings": {}, "digest": read_manifest(region).digest}
     wanted["folder"] = str(kept.shelf_of(region) / "one")
     order = {"region": str(region), "wanted": [wanted], "code": kept.code_hash()}
     program = (
-        "import os, signal; from sasgeo_bench.running import keeper; "
-        "keeper.MAKERS['graph'] = lambda _, into: [(into / 'a').touch(), os.kill(os.getpid(), signal.SIGALRM)]; "
-        "keeper.main()"
+        "import os, signal; from contextlib import suppress; from sasgeo_bench.running import keeper\n"
+        "keeper._AGAIN_S = 0.01\n"
+        "def make(_, into):\n"
+        f"    with suppress({'SystemExit' if is_swallowed else ''}):\n"
+        f"        (into / 'a').touch(); os.kill(os.getpid(), signal.{number})\n"
+        "    signal.pause()\n"
+        "keeper.MAKERS['graph'] = make; keeper.main()"
     )
-    assert of_python(program, input=json.dumps(order)).stderr.strip() == "it was stopped by SIGALRM"
+    said = of_python(program, input=json.dumps(order)).stderr.strip()
+    assert said == f"it was stopped by {'SIGALRM' if is_swallowed else number}"
     assert [*shelf.rglob("*")] == [kept.shelf_of(region)]
 
 
@@ -408,8 +433,135 @@ def test_a_size_that_is_none_is_told_once_and_the_usual_one_holds(monkeypatch):
     monkeypatch.setenv("SASGEO_KEPT_MB", "1 GB")
     assert [room.most_bytes() for _ in range(2)] == [room.MOST_MB * 10**6] * 2
     assert told == ["SASGEO_KEPT_MB is '1 GB', no whole number of megabytes: 4000 are kept at most"]
+    monkeypatch.setenv("SASGEO_KEPT_MB", "9" * 5000)  # Python makes no number of so many digits
+    assert room.most_bytes() == room.MOST_MB * 10**6
+    assert len(told[1]) < 120
 
 
 def test_a_matcher_that_asks_for_something_else_is_refused(place, task):
     ready, _ = replies(place, task, "hostile:AsksForWhatIsNotKept")
     assert (ready.status, "an answer that is none" in ready.message) == ("invalid", True)
+
+
+LIKENESS = [[1.0] * (FAR + 1)] * 5
+BAD = {
+    "a cell of a country": ("field", {"likeness": LIKENESS, "trust": None, "cell_size_m": 1e6}),
+    "a cell of nothing": ("field", {"likeness": LIKENESS, "trust": None, "cell_size_m": -1.0}),
+    "no shares": ("field", {"likeness": [[7.0] * (FAR + 1)] * 5, "trust": None, "cell_size_m": 2.0}),
+    "shares of nothing": ("field", {"likeness": [], "trust": None, "cell_size_m": 2.0}),
+    "endless shares": ("field", {"likeness": [[10**400]], "trust": None, "cell_size_m": 2.0}),
+    "trust of too few": ("field", {"likeness": LIKENESS, "trust": [[1.0]], "cell_size_m": 2.0}),
+    "no reach": ("chart", {"thin": ["road_major"], "reach_m": 5e-324}),
+    "a text": ("chart", {"thin": [], "reach_m": "4"}),
+    "no list": ("chart", {"thin": 7, "reach_m": 4.0}),
+    "a folder": ("graph", {"into": "/elsewhere"}),
+    "a kind that is none": ("truth", {}),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_settings_that_are_none_make_nothing_in_vain_and_what_was_ordered_beside_them_is_made(
+    fault, place, task, monkeypatch
+):
+    region, (what, settings) = town_of(place, task), BAD[fault]
+    digest, made, classes = read_manifest(region).digest, [], read_manifest(region).classes
+    settings = {
+        name: value if value is not LIKENESS else LIKENESS[:1] * len(classes) for name, value in settings.items()
+    }
+    monkeypatch.setattr(keeper, "signal", mock.Mock())
+    monkeypatch.setattr(keeper, "store_field", lambda *_, **__: pytest.fail("it was begun"))
+    monkeypatch.setitem(keeper.MAKERS, "another", lambda _, into: made.append((into / "a").touch()))
+    shelf = kept.shelf_of(region)
+    wanted = [
+        {"what": what, "settings": settings, "digest": digest, "folder": str(shelf / "one")},
+        {"what": "another", "settings": {}, "digest": digest, "folder": str(shelf / "two")},
+    ]
+    order = {"region": str(region), "wanted": wanted, "code": kept.code_hash()}
+    monkeypatch.setattr("sys.stdin", io.StringIO(json.dumps(order)))
+    with pytest.raises(SystemExit) as ended:
+        keeper.main()
+    assert len(str(ended.value).splitlines()) == 1
+    assert "it was begun" not in str(ended.value)
+    assert [path.name for path in shelf.iterdir()] == ["two"]
+    assert room.is_whole(shelf / "two")
+
+
+def test_a_plugin_can_hold_no_lock_that_a_maker_waits_for(place, task, monkeypatch):
+    region, found = town_of(place, task), []
+    monkeypatch.setitem(
+        keeper.MAKERS, "graph", lambda _, into: found.extend([*into.parent.iterdir(), (into / "a").touch()])
+    )
+    shelf = kept.shelf_of(region)
+    keeper.keep(region, shelf / "one", "graph", {}, digest=read_manifest(region).digest)
+    assert found[:-1] == [shelf / ".one.partial"]
+    assert [*shelf.parent.iterdir()] == [shelf]
+
+
+def test_nobody_else_can_look_into_what_is_made_where_the_folder_of_a_map_was_removed(place, task):
+    region = town_of(place, task)
+    shelf = kept.shelf_of(region)
+    shelf.rmdir()
+    keeper.keep(region, shelf / "one", "graph", {}, digest=read_manifest(region).digest)
+    assert shelf.stat().st_mode & 0o077 == 0
+
+
+def test_of_another_map_nothing_is_ordered(place, task, here):
+    region = town_of(place, task)
+    kept.order(region, [{"what": "graph", "settings": {}, "digest": digest} for digest in ("0" * 64, "../..", "")])
+    kept._ORDERS.join()
+    assert here == []
+    assert [*kept.shelf_of(region).iterdir()] == []
+
+
+def test_a_matcher_that_ends_at_each_query_orders_once(place, task, here):
+    region = town_of(place, task)
+    query = task_files.query_bytes(next(iter(task_files.read_queries(task))))
+    with Threaded(spec="graph_only", reach=Reach(readable=[region], hidden=[]), limits=Limits()) as worker:
+        worker.prepare(region)
+        for _ in range(2):
+            kept._ORDERS.join()
+            remove_tree(kept.shelf_of(region))
+            worker.end()
+            worker._seen = -1  # as of a new process
+            assert worker.match(query, top_k=1).status == "ok"
+        kept._ORDERS.join()
+    assert len(here) == 1
+
+
+def test_settings_without_end_are_no_question(place, task):
+    region = town_of(place, task)
+    worker = Worker(spec="graph_only", reach=Reach(readable=[region], hidden=[]), limits=Limits())
+    worker._region, worker._is_kept, worker._seen = region, True, 7
+    wanted = {"what": "chart", "settings": {"thin": ["a" * 70_000]}, "digest": "0"}
+    with pytest.raises(MatchError, match="more than 65536 characters"):
+        worker._given({"nonce": "n", "wanted": wanted}, "n")
+
+
+def test_a_cache_below_a_map_is_hidden_and_nothing_is_kept_in_it(place, task, shelf, tmp_path):
+    region = town_of(place, task)
+    reach = Reach(readable=[region, tmp_path], hidden=[])
+    worker = Worker(spec="graph_only", reach=reach, limits=Limits())
+    policy = worker._policy("/scratch")
+    assert {str(shelf), str(shelf.with_name("rejectors"))} <= {*policy.hidden}
+    assert worker._shelf(region) is None
+    assert not any(path.startswith(str(shelf)) for path in policy.readable)
+
+
+@pytest.mark.usefixtures("here")
+def test_what_is_mapped_can_be_removed(place, task, monkeypatch):
+    region = town_of(place, task)
+    chart = Chart.open(asked(region, "chart", **SETTINGS), read_region(region))
+    monkeypatch.setenv("SASGEO_KEPT_MB", "20")
+    room.Room.of_user().make(20_000_000)
+    assert [*room.Room.of_user().entries()] == []
+    made = Chart.of(read_region(region), thin=tuple(SETTINGS["thin"]), reach_m=SETTINGS["reach_m"])
+    np.testing.assert_array_equal(chart.degree, made.degree)
+
+
+@pytest.mark.usefixtures("here")
+def test_room_that_cannot_be_made_is_not_taken(place, task, monkeypatch):
+    asked(town_of(place, task), "graph")
+    monkeypatch.setenv("SASGEO_KEPT_MB", "1")
+    monkeypatch.setattr(room, "_remove", lambda _: None)
+    with pytest.raises(StoreError, match="holds what cannot be removed"):
+        room.Room.of_user().make(1_000_000)

@@ -175,7 +175,7 @@ class Search:
         floor = max(self.least_energy * weight, 1e-12)
         for part, (*mapped, energies, known) in zip(self.parts.slices, self.windows, strict=True):
             shared = np.float32(weight) if self.parts.is_full(known) else self.parts.sums([known], [under])
-            is_shared = shared >= 0.5 * weight  # of a view that must lie on known imagery
+            is_shared = shared > 0.5 * weight - 0.25  # half of a view must lie on known imagery; cells are whole
             if not is_shared.any():
                 continue
             cosine = np.zeros(self.parts.shape, dtype=np.float32)

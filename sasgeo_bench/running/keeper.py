@@ -25,7 +25,7 @@ from sasgeo_bench.search.view import Chart
 
 _WIDEST_M: Final = 64.0  # cells of a search; a map is padded by as much
 LONGEST_S: Final = 600  # that an order may take: a tenth of it is a map of 100 km2
-_AGAIN_S: Final = 5.0  # until a process that was stopped and goes on is stopped again
+_AGAIN_S: Final = 1.0  # until a process that was stopped and goes on is stopped again
 _FACTORS: Final = (1, 2, 4, 8, 16)  # views of up to 1 km; the next level takes as long as all of these
 
 

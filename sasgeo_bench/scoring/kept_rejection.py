@@ -124,11 +124,12 @@ def _programs() -> bytes | None:
     None if a file of theirs has changed since this process began, which may run what it was before.
     """
     roots = [Path(str(sys.modules[name].__file__)).parent for name in SHIPPED_MODULES if name in sys.modules]
-    paths = sorted(path for root in roots for path in root.rglob("*") if path.suffix != ".pyc" and path.is_file())
-    about = tuple((path, path.stat().st_mtime_ns) for path in paths)
-    if max(changed_ns for _, changed_ns in about) >= psutil.Process().create_time() * 1e9:
-        return None
-    return _digest(about)
+    found = (path for root in roots for path in root.rglob("*") if path.parent.name != "__pycache__")
+    with suppress(FileNotFoundError):  # it went meanwhile, as what an editor writes
+        about = tuple((path, path.stat().st_mtime_ns) for path in sorted(found) if path.is_file())
+        if max(changed_ns for _, changed_ns in about) < psutil.Process().create_time() * 1e9:
+            return _digest(about)
+    return None
 
 
 @cache

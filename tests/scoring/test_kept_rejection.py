@@ -4,6 +4,8 @@
 import os
 import time
 from dataclasses import replace
+from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pandas as pd
@@ -152,6 +154,9 @@ def test_code_and_libraries_of_other_versions_are_another_program(tmp_path, monk
     monkeypatch.setattr(kept_rejection, "SHIPPED_MODULES", ("sasgeo_like", "sasgeo_none"))
     __import__("sasgeo_like")
     before = of_program("limit = 1")
+    compiled = path.parent / "__pycache__" / "rule.cpython-311.pyc.140234"  # while another process writes it
+    compiled.parent.mkdir()
+    compiled.touch()
     assert before == of_program("limit = 1")
     assert of_program("limit = 2", changed_s=time.time() + 1) is None  # since this process began
     others = [of_program("limit = 2", changed_s=2e8), of_program("limit = 1", changed_s=3e8, name="other.py")]
@@ -163,6 +168,12 @@ def test_code_and_libraries_of_other_versions_are_another_program(tmp_path, monk
     monkeypatch.setattr(kept_rejection, "_programs", lambda: None)
     rejection._evaluated(task(tmp_path / "kept"))
     assert not (tmp_path / "kept").exists()
+
+
+def test_a_program_of_which_a_file_goes_meanwhile_is_none(monkeypatch):
+    monkeypatch.setattr(kept_rejection, "_digest", mock.Mock(side_effect=FileNotFoundError))
+    monkeypatch.setattr(kept_rejection.psutil, "Process", lambda: SimpleNamespace(create_time=lambda: 1e12))
+    assert kept_rejection._programs() is None
 
 
 def test_the_packages_that_ship_are_hashed():

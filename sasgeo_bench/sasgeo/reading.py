@@ -22,7 +22,8 @@ from sasgeo_bench.sasgeo.joint import columns, of_prior
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, explained, read_field, with_unknown_margins
+from sasgeo_bench.sasgeo.overlap import Compared
+from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, read_field, with_unknown_margins
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
@@ -304,7 +305,7 @@ class Reading:
         switches, seen = self.reader.switches, self.query.evidence
         if seen.is_certain or not (switches.is_correlated(seen) and switches.reads_probabilities):
             return terms
-        by_map = explained(seen, self.reader.region.classes, self.reader.field, poses)
+        by_map = Compared.of(seen, self.reader.region.classes, self.reader.field, poses).explained
         return np.column_stack((terms, blend.alpha * by_map, blend.alpha * of_prior(poses, self.query.prior)))
 
     def sigma_m(self, pose: Pose) -> float:

@@ -18,9 +18,9 @@ from sasgeo_bench.sasgeo.conformal import levels_of
 from sasgeo_bench.sasgeo.graph import GraphScore
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
 from sasgeo_bench.sasgeo.learning import learn
+from sasgeo_bench.sasgeo.overlap import INDEPENDENT
 from sasgeo_bench.sasgeo.raster import (
     CELL_M,
-    INDEPENDENT,
     RasterView,
     likeness_by_hand,
     read_field,

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A view held against the map under a pose, class by class: areas on either side, what both hold, what that tells."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.search.field import FULL, Field, between, squares
+
+INDEPENDENT: Final = 20.0  # cells of a view that say something of their own, in each class; from Andorra's picture
+FEW_M2: Final = 8.0  # that much of a class varies by chance
+LEAST_M2: Final = 4.0  # less is no overlap: a cell of the search
+UNLIKE_M2: Final = 400.0  # of a class, of which a view and a map may differ by chance
+_MOST_ALIKE: Final = 0.99  # squared correlation
+_LEAST: Final = 1e-6
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Compared:
+    """Areas of each class under each pose, square metres, shape (M, C), over cells that view and map know.
+
+    `seen` and `mapped` are sums of P(present) and of the degree of the map, `both` that of their product, `seen_twice`
+    and `mapped_twice` those of their squares; `known` is the area of the cells. A class that the view lacks has none.
+    """
+
+    known: Floats
+    seen: Floats
+    mapped: Floats
+    both: Floats
+    seen_twice: Floats
+    mapped_twice: Floats
+
+    @classmethod
+    def of(cls, evidence: Evidence, classes: Sequence[str], field: Field, poses: Sequence[Pose]) -> Self:
+        """Compare a view with the map at each pose, in squares of about a cell of the field.
+
+        Examples
+        --------
+        >>> from sasgeo_bench.geometry.grid import Grid
+        >>> grid = Grid(epsg=0, west_m=-4.0, north_m=4.0, cell_size_m=2.0, rows=4, cols=4)
+        >>> water, known = np.full((1, 4, 4), FULL, dtype=np.uint8), np.full((4, 4), FULL, dtype=np.uint8)
+        >>> water[:, :, 2:] = 0  # in the west
+        >>> seen = np.tile([0.3, 0.3, 0.1, 0.1], (1, 4, 1))
+        >>> view = Evidence.of_probabilities(("water",), seen, cell_size_m=2.0)
+        >>> north, south = (Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg) for yaw_deg in (0.0, 180.0))
+        >>> found = Compared.of(view, ("water",), Field.of(grid=grid, layers=water, known=known), [north, south])
+        >>> found.mapped.tolist(), found.both.round(1).tolist(), found.overlaps.round(2).tolist()
+        ([[32.0], [32.0]], [[9.6], [3.2]], [[0.27], [0.08]])
+        >>> found.explained.round(2).tolist()
+        [[0.51], [0.0]]
+        """
+        pool = max(1, round(field.grid.cell_size_m / evidence.cell_size_m))
+        names = [name for name in evidence.classes if name in classes and (evidence.layer(name) != UNKNOWN).any()]
+        layers, at = [evidence.classes.index(name) for name in names], [classes.index(name) for name in names]
+        chances = evidence.probabilities()[layers]
+        is_known = ~np.isnan(chances)
+        bands = np.concatenate((np.where(is_known, chances, 0.0), is_known)).astype(np.float32)
+        summed, frame = squares(bands, pool, cell_size_m=evidence.cell_size_m)
+        seen, known = np.split(summed / pool**2, 2)
+        seen = seen / np.maximum(known, _LEAST)
+        parts = np.stack((known, known * seen, known * seen**2)).reshape(3, len(at), frame.rows * frame.cols)
+        found = np.zeros((len(poses), 6, len(classes)))
+        for row, pose in zip(found, poses, strict=True):
+            under = field.cells.under(between(frame, pose, field.grid), frame.shape)
+            degree = np.stack([under.band(one).ravel() for one in (*at, len(classes))]).astype(np.float32) / FULL
+            mapped, is_mapped = degree[:-1], degree[-1]
+            row[:3, at] = parts @ is_mapped
+            mapped *= is_mapped
+            row[3, at], row[4, at] = np.vecdot(parts[:2], mapped)
+            row[5, at] = np.vecdot(parts[0], mapped * mapped)
+        known_m2, seen_m2, seen_twice_m2, mapped_m2, both_m2, mapped_twice_m2 = (
+            np.moveaxis(found, 1, 0) * frame.cell_size_m**2
+        )
+        return cls(
+            known=known_m2,
+            seen=seen_m2,
+            mapped=mapped_m2,
+            both=both_m2,
+            seen_twice=seen_twice_m2,
+            mapped_twice=mapped_twice_m2,
+        )
+
+    @property
+    def overlaps(self) -> Floats:
+        """Return the intersection over union of each class, 0..1; 0 where neither side holds it."""
+        either = self.seen + self.mapped - self.both
+        return np.where(either > LEAST_M2, self.both / np.maximum(either, LEAST_M2), 0.0)
+
+    @property
+    def unlike(self) -> Floats:
+        """Return how unlike the amounts of each class are, 0..1: their difference over their sum."""
+        return np.asarray(np.abs(self.seen - self.mapped) / (self.seen + self.mapped + UNLIKE_M2))
+
+    @property
+    def seen_varies(self) -> Floats:
+        """Return the variance of the view within the known cells, times their area."""
+        return self.seen_twice - self.seen**2 / np.maximum(self.known, LEAST_M2)
+
+    @property
+    def map_varies(self) -> Floats:
+        """Return the variance of the map within the known cells, times their area."""
+        return self.mapped_twice - self.mapped**2 / np.maximum(self.known, LEAST_M2)
+
+    @property
+    def explained(self) -> Floats:
+        """Return how well the map explains each class of the view, nats.
+
+        It is -n / 2 ln(1 - r^2), 0 where r is negative: the log-likelihood ratio of a straight line through n
+        independent cells against their mean, r the correlation of P(present) with the degree of the map, n
+        `INDEPENDENT`. Gains by cell charge what is seen and not mapped; r charges what is mapped and not seen as well,
+        and a view that is faint all over as little as a clear one.
+        """
+        common = self.both - self.seen * self.mapped / np.maximum(self.known, LEAST_M2)
+        squared = common**2 / ((self.seen_varies + FEW_M2) * (self.map_varies + FEW_M2))
+        is_there = (common > 0) & (self.known >= LEAST_M2)
+        return np.where(is_there, -INDEPENDENT / 2 * np.log1p(-np.minimum(squared, _MOST_ALIKE)), 0.0)

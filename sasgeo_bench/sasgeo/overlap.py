@@ -16,7 +16,12 @@ INDEPENDENT: Final = 20.0  # cells of a view that say something of their own, in
 FEW_M2: Final = 8.0  # that much of a class varies by chance
 LEAST_M2: Final = 4.0  # less is no overlap: a cell of the search
 UNLIKE_M2: Final = 400.0  # of a class, of which a view and a map may differ by chance
+SEARCHED: Final = 30.0  # nats of a class whose overlap is whole, in a search; as the next two, from train places
+RARE_M2: Final = 1000.0  # of a class in a view that count half
+CROWDED: Final = 0.03  # charge for a mapped cell, as a share of what one brings that is seen
+BADLY_SEEN, BLUNT = 0.25, 0.05  # overlap of lines at which areas have half of their say, and how fast that falls
 _MOST_ALIKE: Final = 0.99  # squared correlation
+_MOST_FADED: Final = 0.9  # a class that fades less is taken as it is
 _LEAST: Final = 1e-6
 
 Floats = NDArray[np.float64]
@@ -38,8 +43,19 @@ class Compared:
     mapped_twice: Floats
 
     @classmethod
-    def of(cls, evidence: Evidence, classes: Sequence[str], field: Field, poses: Sequence[Pose]) -> Self:
+    def of(
+        cls,
+        evidence: Evidence,
+        classes: Sequence[str],
+        field: Field,
+        poses: Sequence[Pose],
+        *,
+        near: Floats | None = None,
+    ) -> Self:
         """Compare a view with the map at each pose, in squares of about a cell of the field.
+
+        `near`, shape (C,), is the degree that the field has at most beside a class (`ScorerModel.likeness`): with it
+        degrees are those of cells that the class covers, as if nothing faded.
 
         Examples
         --------
@@ -66,11 +82,14 @@ class Compared:
         seen, known = np.split(summed / pool**2, 2)
         seen = seen / np.maximum(known, _LEAST)
         parts = np.stack((known, known * seen, known * seen**2)).reshape(3, len(at), frame.rows * frame.cols)
+        faded = None if near is None else np.minimum(near[at], _MOST_FADED).astype(np.float32)[:, None]
         found = np.zeros((len(poses), 6, len(classes)))
         for row, pose in zip(found, poses, strict=True):
             under = field.cells.under(between(frame, pose, field.grid), frame.shape)
             degree = np.stack([under.band(one).ravel() for one in (*at, len(classes))]).astype(np.float32) / FULL
             mapped, is_mapped = degree[:-1], degree[-1]
+            if faded is not None:  # inverts `raster.read_field`: covered share u has degree u + near (1 - u)
+                np.clip((mapped - faded) / (1 - faded), 0, 1, out=mapped)
             row[:3, at] = parts @ is_mapped
             mapped *= is_mapped
             row[3, at], row[4, at] = np.vecdot(parts[:2], mapped)
@@ -121,3 +140,52 @@ class Compared:
         squared = common**2 / ((self.seen_varies + FEW_M2) * (self.map_varies + FEW_M2))
         is_there = (common > 0) & (self.known >= LEAST_M2)
         return np.where(is_there, -INDEPENDENT / 2 * np.log1p(-np.minimum(squared, _MOST_ALIKE)), 0.0)
+
+
+def overlap_weights(evidence: Evidence, classes: Sequence[str]) -> NDArray[np.float32]:
+    """Return weights of the cells of a view by which a map overlaps it, to first order, nats, shape (C, rows, cols).
+
+    The intersection over union b / (s + m - b) grows with b, what both hold, and falls with m, what the map holds.
+    About a place where the map holds as much as the view, s, that is a sum over the cells of the map: each counts
+    (p - `CROWDED`) / (s + `RARE_M2`), p being P(present) of the view. So it can be searched for in the Fourier domain,
+    as gains are.
+
+    Examples
+    --------
+    >>> cells = np.zeros((1, 2, 100, 100), dtype=np.uint8)[0]
+    >>> cells[0, :10] = 1
+    >>> seen = Evidence(classes=("building", "water"), cells=cells, cell_size_m=1.0)
+    >>> weights = overlap_weights(seen, ("water", "building"))
+    >>> [f"{weight:.5f}" for weight in weights[1, [0, 99], 0]], bool(weights[0].any())
+    (['0.01455', '-0.00045'], False)
+    """
+    weights, area_m2 = np.zeros((len(classes), *evidence.shape), dtype=np.float32), evidence.cell_size_m**2
+    for name, chances in zip(evidence.classes, evidence.probabilities(), strict=True):
+        seen_m2 = float(np.nansum(chances)) * area_m2
+        if name in classes and seen_m2 > LEAST_M2:
+            share = SEARCHED * area_m2 / (seen_m2 + RARE_M2)
+            weights[classes.index(name)] = np.nan_to_num(share * (chances - CROWDED))
+    return weights
+
+
+def overlap_of(compared: Compared, is_line: NDArray[np.bool_], *, is_gated: bool = True) -> Floats:
+    """Return the overlap of each pose of a list, shape (M,): that of its lines, and of areas as far as lines are faint.
+
+    Lines last, areas are filled and cleared: where a view shows lines well, at the best of all poses, it is they that
+    tell places apart. A detector that errs much loses lines first; then areas have all the say they can get. Unless it
+    `is_gated`, all classes have it always. `is_line` has shape (C,).
+
+    Examples
+    --------
+    >>> flat = np.array([[100.0, 100.0]])
+    >>> some = [[[100.0, 0.0], [0.0, 100.0]], [[5.0, 0.0], [0.0, 100.0]]]  # lines: seen well, hardly seen
+    >>> whole = {name: np.repeat(flat, 2, axis=0) for name in ("known", "seen", "mapped", "seen_twice", "mapped_twice")}
+    >>> [overlap_of(Compared(both=np.array(both), **whole), np.array([True, False])).round(2).tolist() for both in some]
+    [[1.0, 0.0], [0.03, 0.99]]
+    """
+    overlaps = compared.overlaps
+    of_lines, of_areas = overlaps[:, is_line].sum(axis=1), overlaps[:, ~is_line].sum(axis=1)
+    if not is_gated or not len(of_lines):
+        return np.asarray(of_lines + of_areas)
+    say = 1 / (1 + np.exp((of_lines.max() - BADLY_SEEN) / BLUNT))
+    return np.asarray(of_lines + say * of_areas)

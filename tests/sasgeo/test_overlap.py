@@ -11,11 +11,12 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, LayerBits, cell_offsets_m, observe
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.overlap import INDEPENDENT, UNLIKE_M2, Compared
+from sasgeo_bench.sasgeo.overlap import INDEPENDENT, SEARCHED, UNLIKE_M2, Compared, overlap_of, overlap_weights
 from sasgeo_bench.sasgeo.raster import likeness_by_hand, read_field
 from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
-from sasgeo_bench.search.field import FULL, Field
+from sasgeo_bench.search.field import FULL, Field, Template
+from sasgeo_bench.search.find import score_at
 
 
 @pytest.fixture(scope="module")
@@ -111,15 +112,82 @@ def test_by_hand_a_view_and_a_map_that_share_a_third():
     assert less.unlike[0, 1] == pytest.approx(64 / (64 + UNLIKE_M2))
 
 
-def test_a_view_that_is_certain_has_the_terms_of_the_paper_alone(tiny, widest):
+def test_terms_of_a_certain_view_and_of_a_faint_one(tiny, widest):
     query, pose = widest
     count = len(tiny.region.classes)
     model = ScorerModel.by_hand(tiny.region.classes)
     seen = replace(query, evidence=faint(query, tiny.region, pose))
-    for switches, of_faint in ((Switches(), 2 * count + 2), (Switches(reads_probabilities=False), count)):
+    alone = {"correlates": "never"}
+    for switches, of_certain, of_faint in (
+        (Switches(), count + 4, 2 * count + 2),
+        (Switches(reads_probabilities=False), count + 4, count + 4),
+        (Switches(**alone), count, count),
+    ):
         reader = Reader.of(tiny.region, model, switches)
-        for view, columns in ((query, count), (seen, of_faint)):
-            terms = reader.read(view).terms([pose], None)
+        for view, columns in ((query, of_certain), (seen, of_faint)):
+            reading = reader.read(view)
+            terms = reading.terms([pose], None)
             assert terms.shape == (1, columns)
-            classes = reader.read(view).by_class([pose]) * model.scaling
-            assert (terms[:, :count] == classes).all()
+            assert (terms[:, :count] == reading.by_class([pose]) * model.scaling).all()
+            is_ours = columns == count + 4
+            assert (reading.searched is not reading.template) == is_ours
+            assert reading.beside([pose]).any() == is_ours
+            if is_ours:
+                assert (terms[:, count:] == reading.beside([pose]) * model.blend.beside).all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "left_out"),
+    [
+        ({"weighs_prior": False}, [0, 1]),
+        ({"weighs_amounts": False}, [2]),
+        ({"weighs_overlap": "never"}, [3]),
+        ({"weighs_amounts": False, "weighs_overlap": "never"}, [2, 3]),
+    ],
+)
+def test_each_term_is_left_out_by_its_own_switch(tiny, widest, changed, left_out):
+    query, pose = widest
+    off = replace(pose, yaw_deg=pose.yaw_deg + 9.0, scale=pose.scale * 1.02)
+    whole, part = (
+        Reader.of(tiny.region, ScorerModel.by_hand(tiny.region.classes), switches).read(query).beside([pose, off])
+        for switches in (Switches(), Switches(**changed))
+    )
+    kept = [at for at in range(4) if at not in left_out]
+    assert not part[:, left_out].any()
+    assert (part[:, kept] == whole[:, kept]).all()
+
+
+def test_the_overlap_of_a_faded_map_is_that_of_the_map_itself(tiny, widest):
+    query, pose = widest
+    classes, tables = tiny.region.classes, likeness_by_hand(tiny.region.classes)
+    bare = tables.copy()
+    bare[:, 1:] = 0
+    found = [
+        Compared.of(query.evidence, classes, read_field(tiny.region, one), [pose], near=one[:, 1])
+        for one in (tables, bare)
+    ]
+    for name in ("mapped", "both"):
+        faded, plain = (getattr(one, name)[0] for one in found)
+        assert faded == pytest.approx(plain, rel=0.06, abs=8.0)
+    assert found[0].overlaps == pytest.approx(found[1].overlaps, abs=0.03)
+
+
+def test_places_that_overlap_score_more_in_the_search(tiny, field, widest):
+    query, pose = widest
+    weights = overlap_weights(query.evidence, tiny.region.classes)
+    view = Template(weights=weights, known=np.zeros(query.evidence.shape, np.float32), cell_size_m=1.0)
+    away = [replace(pose, easting_m=pose.easting_m + east_m) for east_m in (-90.0, 70.0, 130.0)]
+    assert score_at(field, view, pose) > max(score_at(field, view, one) for one in away)
+    assert score_at(field, view, pose) < SEARCHED * len(tiny.region.classes)
+
+
+def test_areas_say_as_much_as_lines_are_badly_seen():
+    lines, areas = np.array([0.6, 0.0]), np.array([0.0, 0.6])
+    says = []
+    for share in (1.0, 0.4, 0.1):
+        both = 100.0 * np.column_stack((share * lines, areas))
+        flat = np.full((2, 2), 60.0)
+        some = Compared(known=flat, seen=flat, mapped=flat, both=both, seen_twice=flat, mapped_twice=flat)
+        says.append(overlap_of(some, np.array([True, False]))[1])
+        assert overlap_of(some, np.array([True, False]), is_gated=False)[1] == some.overlaps[1, 1]
+    assert says[0] < 0.01 < says[1] < says[2] < some.overlaps[1, 1]

@@ -33,8 +33,8 @@ class Blend:
     eta: float = 0.1
     heading: float = 0.3
     scale: float = 0.3
-    amount: float = 2.0
-    overlap: float = 20.0
+    amount: float = 3.0
+    overlap: float = 30.0
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -33,7 +33,7 @@ class Blend:
     eta: float = 0.1
     heading: float = 0.3
     scale: float = 0.3
-    amount: float = 3.0
+    amount: float = 1.0
     overlap: float = 30.0
 
     def __post_init__(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.search.field import FULL, Field, between, squares
 
 INDEPENDENT: Final = 20.0  # cells of a view that say something of their own, in each class; from Andorra's picture
@@ -75,13 +75,14 @@ class Compared:
         pool = max(1, round(field.grid.cell_size_m / evidence.cell_size_m))
         names = [name for name in evidence.classes if name in classes and (evidence.layer(name) != UNKNOWN).any()]
         layers, at = [evidence.classes.index(name) for name in names], [classes.index(name) for name in names]
-        chances = evidence.probabilities()[layers]
-        is_known = ~np.isnan(chances)
-        bands = np.concatenate((np.where(is_known, chances, 0.0), is_known)).astype(np.float32)
+        is_known = evidence.cells[layers] != UNKNOWN
+        chances = np.where(is_known, evidence.probabilities()[layers], 0.0)
+        bands = np.concatenate((chances, is_known), dtype=np.float32)
         summed, frame = squares(bands, pool, cell_size_m=evidence.cell_size_m)
         seen, known = np.split(summed / pool**2, 2)
         seen = seen / np.maximum(known, _LEAST)
         parts = np.stack((known, known * seen, known * seen**2)).reshape(3, len(at), frame.rows * frame.cols)
+        whole = parts.sum(axis=2, dtype=np.float64)
         faded = None if near is None else np.minimum(near[at], _MOST_FADED).astype(np.float32)[:, None]
         found = np.zeros((len(poses), 6, len(classes)))
         for row, pose in zip(found, poses, strict=True):
@@ -90,8 +91,11 @@ class Compared:
             mapped, is_mapped = degree[:-1], degree[-1]
             if faded is not None:  # inverts `raster.read_field`: covered share u has degree u + near (1 - u)
                 np.clip((mapped - faded) / (1 - faded), 0, 1, out=mapped)
-            row[:3, at] = parts @ is_mapped
-            mapped *= is_mapped
+            if is_mapped.size and is_mapped.min() == 1:  # well inside the map, as most are
+                row[:3, at] = whole
+            else:
+                row[:3, at] = parts @ is_mapped
+                mapped *= is_mapped
             row[3, at], row[4, at] = np.vecdot(parts[:2], mapped)
             row[5, at] = np.vecdot(parts[0], mapped * mapped)
         known_m2, seen_m2, seen_twice_m2, mapped_m2, both_m2, mapped_twice_m2 = (
@@ -147,8 +151,8 @@ def overlap_weights(evidence: Evidence, classes: Sequence[str]) -> NDArray[np.fl
 
     The intersection over union b / (s + m - b) grows with b, what both hold, and falls with m, what the map holds.
     About a place where the map holds as much as the view, s, that is a sum over the cells of the map: each counts
-    (p - `CROWDED`) / (s + `RARE_M2`), p being P(present) of the view. So it can be searched for in the Fourier domain,
-    as gains are.
+    (p - `CROWDED`) / (s + `RARE_M2`), p being 1 where the view shows the class, 0 elsewhere. So it can be searched for
+    in the Fourier domain, as gains are.
 
     Examples
     --------
@@ -160,11 +164,12 @@ def overlap_weights(evidence: Evidence, classes: Sequence[str]) -> NDArray[np.fl
     (['0.01455', '-0.00045'], False)
     """
     weights, area_m2 = np.zeros((len(classes), *evidence.shape), dtype=np.float32), evidence.cell_size_m**2
-    for name, chances in zip(evidence.classes, evidence.probabilities(), strict=True):
-        seen_m2 = float(np.nansum(chances)) * area_m2
+    for name, cells in zip(evidence.classes, evidence.cells, strict=True):
+        seen_m2 = np.count_nonzero(cells == PRESENT) * area_m2
         if name in classes and seen_m2 > LEAST_M2:
             share = SEARCHED * area_m2 / (seen_m2 + RARE_M2)
-            weights[classes.index(name)] = np.nan_to_num(share * (chances - CROWDED))
+            each = np.array([-CROWDED, 1 - CROWDED, 0.0], dtype=np.float32)  # absent, present, unknown
+            weights[classes.index(name)] = (np.float32(share) * each).take(cells)
     return weights
 
 

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Trials of the joint score: every arm is a matcher, and the table says what stored answers say."""
 
+from collections import Counter
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import sasgeo_bench as sgb
 from benchmarks import joint_trials
@@ -9,6 +11,7 @@ from benchmarks.joint_trials import ARMS, USUAL, Answer, lines, read_answers
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.variants import Sasgeo
 
+ROOT = Path(__file__).parents[2]
 OURS = ("searches_overlap", "weighs_prior", "weighs_amounts", "weighs_overlap")
 
 
@@ -53,3 +56,16 @@ def test_suites_are_drawn_before_they_are_asked():
     assert {suite for suite, *_ in joint_trials.ASKED} | set(joint_trials.LESSONS) == set(joint_trials.DRAWN)
     assert {joint_trials.half_of(name) for name in joint_trials.DATED} == {"a", "b"}
     assert joint_trials.half_of("malabo@2014-01-01") == "a"
+
+
+def test_what_stands_finds_more_with_errors_and_loses_nowhere_beyond_one_view():
+    stored = read_answers(ROOT / "docs" / "results" / "joint-trials.csv")
+    assert {one.arm for one in stored} <= set(ARMS)
+    ours, usual = (
+        {(one.group, one.query_id): one.is_found for one in stored if one.arm == arm} for arm in ("sasgeo", USUAL)
+    )
+    assert ours.keys() == usual.keys()
+    lost = Counter(group for group, query in ours if usual[group, query] and not ours[group, query])
+    won = Counter(group for group, query in ours if ours[group, query] and not usual[group, query])
+    assert max(lost.values(), default=0) <= 1
+    assert all(won[group] > lost[group] + 5 for group in ("clean x3", "clean x4", "volatile-lure"))

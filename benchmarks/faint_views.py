@@ -26,7 +26,7 @@ import sasgeo_bench as sgb
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.geometry.pose import wrap_deg
 from sasgeo_bench.regions.evidence import UNKNOWN
-from sasgeo_bench.sasgeo.raster import INDEPENDENT
+from sasgeo_bench.sasgeo.overlap import INDEPENDENT
 from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.trackers import SasgeoTrack

@@ -13,6 +13,7 @@ from sasgeo_bench.sasgeo.weights import Gains, even_gains, likelihood_gains
 
 Weights = Literal["even", "fitted"]
 Correlated = Literal["always", "faint", "never"]
+Overlaps = Literal["gated", "always", "never"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +30,11 @@ class Switches:
     of a class are taken to hang together ("faint": in views with probabilities), else each cell counts alone: see
     `raster.RasterView.levelled` and `damped`. `reads_probabilities` of views that have some, else each cell is the
     likelier of present and absent.
+
+    The last four are of certain views in which errors hang together. `searches_overlap` adds the overlap of view and
+    map to the template of the search, so that its list holds places that gains alone miss. `weighs_prior`,
+    `weighs_amounts` and `weighs_overlap` add the prior of heading and scale, unlike amounts of the classes, and the
+    overlap to the joint score: "gated", areas count as far as lines are badly seen. See `overlap`.
     """
 
     weights: Weights = "fitted"
@@ -41,6 +47,10 @@ class Switches:
     burns_vectors: bool = False
     correlates: Correlated = "always"
     reads_probabilities: bool = True
+    searches_overlap: bool = True
+    weighs_prior: bool = True
+    weighs_amounts: bool = True
+    weighs_overlap: Overlaps = "gated"
 
     @property
     def learns(self) -> bool:
@@ -51,13 +61,15 @@ class Switches:
         """Return whether errors of a class in a view are taken to hang together."""
         return self.correlates == "always" or (self.correlates == "faint" and not evidence.is_certain)
 
-    def seen(self, evidence: Evidence) -> Evidence:
+    def read(self, evidence: Evidence) -> Evidence:
         """Return a view as this ablation reads it."""
         if not self.reads_probabilities:
             evidence = evidence.replace(evidence.cells)
-        if not self.is_unknown_silent:
-            evidence = evidence.without_unknown()
-        return with_unknown_margins(evidence)
+        return evidence if self.is_unknown_silent else evidence.without_unknown()
+
+    def seen(self, evidence: Evidence) -> Evidence:
+        """Return a view for the gains of Eq. 7: what lies beside a seen line is open."""
+        return with_unknown_margins(self.read(evidence))
 
     def gains(self, model: ScorerModel, *, age_years: float, season: str = "") -> Gains:
         """Return the gains of Eq. 7 for the age of a map and a season, in the order of the classes of the model."""

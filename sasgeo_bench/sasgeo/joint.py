@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint score of a list of modes, Eq. 11 of the SASGeo paper: raster, graph and contradiction; heading and scale."""
+"""Joint score of a list of modes, Eq. 11 of the SASGeo paper: raster, graph and contradiction; and what is ours."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -15,9 +15,12 @@ HALF_NODES: Final = 6.0  # a graph of so many nodes has half its weight
 _LEAST_SIGMA: Final = 1e-3  # of a scale that is known: a search still takes steps of it
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Blend:
-    """Weights of raster, graph and contradiction in Eq. 11; single views have no odometry term (gamma).
+    """Weights of the terms of the joint score: raster, graph and contradiction in Eq. 11, and what is ours.
+
+    `heading` and `scale` weigh the prior of the query (`of_prior`), `amount` how unlike the amounts of the classes are,
+    `overlap` that of view and map (`overlap.overlap_of`). Single views have no odometry term (gamma).
 
     Raises
     ------
@@ -28,12 +31,21 @@ class Blend:
     alpha: float = 1.0
     beta: float = 0.5
     eta: float = 0.1
+    heading: float = 0.3
+    scale: float = 0.3
+    amount: float = 1.0
+    overlap: float = 30.0
 
     def __post_init__(self) -> None:
-        for name in ("alpha", "beta", "eta"):
-            value = getattr(self, name)
+        for item in fields(self):
+            value = getattr(self, item.name)
             if not (np.isfinite(value) and value >= 0):
-                raise ConfigError(f"{name} of the joint score is at least 0 and finite, got {value!r}")
+                raise ConfigError(f"{item.name} of the joint score is at least 0 and finite, got {value!r}")
+
+    @property
+    def beside(self) -> NDArray[np.float64]:
+        """Return the weights of our terms, shape (4,): heading, scale, amount, overlap."""
+        return np.array([self.heading, self.scale, self.amount, self.overlap])
 
 
 def contradiction(by_class: NDArray[np.float64]) -> NDArray[np.float64]:

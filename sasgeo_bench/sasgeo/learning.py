@@ -4,7 +4,7 @@
 import math
 from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from typing import Final, Self
@@ -165,11 +165,13 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
         lists = _searched(views, regions, model, switches, plan or Plan())
         if switches.learns and lists:
             model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
-    drawn = [one for one in lists if one.query.vectors is not None]
-    if not (switches.has_graph and drawn):
+    if not lists:
         return model
-    model = replace(model, rules=_fit_rules(drawn, regions))
-    return replace(model, blend=_fit_blend(drawn, model, regions))
+    drawn = [one for one in lists if one.query.vectors is not None] if switches.has_graph else []
+    if drawn:
+        model = replace(model, rules=_fit_rules(drawn, regions))
+    plain = [one for one in lists if one.query.vectors is None or not switches.has_graph]
+    return replace(model, blend=_fit_blend(drawn, plain, model, regions))
 
 
 def classes_of(regions: Iterable[Region]) -> tuple[str, ...]:
@@ -205,11 +207,12 @@ def _even(views: ViewsByMap, classes: tuple[str, ...]) -> ScorerModel:
 
 @dataclass(frozen=True, kw_only=True)
 class _ScoredModes:
-    """The right place of a query, first, and the wrong modes of its search, with their scores by class."""
+    """The right place of a query, first, and the wrong modes of its search, with scores by class and `beside` them."""
 
     query: Query
     poses: Sequence[Pose]
     by_class: NDArray[np.float64]
+    beside: NDArray[np.float64]
 
     @cached_property
     def seen(self) -> ObservedGraph:
@@ -233,16 +236,26 @@ def _fit_rules(drawn: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> 
     return fit_rules(right, wrong)
 
 
-def _fit_blend(lists: Sequence[_ScoredModes], model: ScorerModel, regions: Mapping[str, Region]) -> Blend:
-    """Fit the weights of the joint score by the same logit, with fixed scales of evidence."""
-    sums = []
-    even = Blend(alpha=1.0, beta=1.0, eta=1.0)
-    for one, mapped in _graphs(lists, regions):
+_SURE: Final = 0.5  # width of the prior of the factor of all weights, in logarithms: views may be told apart by any
+
+
+def _fit_blend(
+    drawn: Sequence[_ScoredModes], plain: Sequence[_ScoredModes], model: ScorerModel, regions: Mapping[str, Region]
+) -> Blend:
+    """Fit the weights of the joint score by the same logit to views with a graph and without, with fixed exponents.
+
+    Each stays near its weight by hand, and so does their common factor: views with vectors alone are often separable.
+    """
+    sums, even = [], Blend(alpha=1.0, beta=1.0, eta=1.0)
+    for one, mapped in _graphs(drawn, regions):
         graph = np.array([found.score for found in verify(one.seen, mapped, one.poses, model.rules)])
         rows = columns(one.by_class * model.scaling, graph, even, nodes=len(one.seen.nodes))
-        sums.append(np.column_stack((rows[:, :-2].sum(axis=1), rows[:, -2:])))
-    alpha, beta, eta = fit_scaling(sums, start=(1.0, Blend().beta, Blend().eta)).tolist()
-    return Blend(alpha=alpha, beta=beta, eta=eta)
+        sums.append(np.column_stack((rows[:, :-2].sum(axis=1), rows[:, -2:], one.beside)))
+    for one in plain:
+        raster = (one.by_class * model.scaling).sum(axis=1)
+        sums.append(np.column_stack((raster, np.zeros((len(raster), 2)), one.beside)))
+    start = astuple(Blend())
+    return Blend(*fit_scaling(sums, start=start, common_width=_SURE).tolist())
 
 
 def _pose(truth: Truth) -> Pose:
@@ -335,11 +348,11 @@ def _list(query: Query, pose: Pose, reader: Reader, plan: Plan, classes: tuple[s
     """Score the true pose of a view and the wrong modes that a search finds; 0 in classes that the map lacks."""
     reading = reader.read(query)
     modes = search(
-        reader.field, reading.template, query.prior, reading.plan(plan), count=16
+        reader.field, reading.searched, query.prior, reading.plan(plan), count=16
     ).modes  # of each training search
     here = (pose.easting_m, pose.northing_m)
     wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
     poses = [pose, *wrong]
     by_class = np.zeros((len(poses), len(classes)))
     by_class[:, [classes.index(name) for name in reader.region.classes]] = reading.by_class(poses)
-    return _ScoredModes(query=query, poses=poses, by_class=by_class)
+    return _ScoredModes(query=query, poses=poses, by_class=by_class, beside=reading.beside(poses))

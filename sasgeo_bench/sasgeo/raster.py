@@ -257,60 +257,6 @@ def _around(layers: NDArray[np.float32], is_known: NDArray[np.float32], *, sigma
     return means
 
 
-INDEPENDENT: Final = 20.0  # cells of a view that say something of their own, in each class; from Andorra's picture
-_FEW: Final = 2.0  # cells of the search: that much of a class varies by chance
-_MOST_ALIKE: Final = 0.99  # squared correlation
-
-
-def explained(evidence: Evidence, classes: Sequence[str], field: Field, poses: Sequence[Pose]) -> NDArray[np.float64]:
-    """Return how well the map at each pose explains the probabilities of each class, nats, shape (M, C).
-
-    It is -n / 2 ln(1 - r^2), 0 where r is negative: the log-likelihood ratio of a straight line through n independent
-    cells against their mean, r the correlation of P(present) with the degree of the map over known cells, n
-    `INDEPENDENT`. Gains by cell charge what is seen and not mapped; r charges what is mapped and not seen as well, and
-    a view that is faint all over as little as a clear one.
-
-    Examples
-    --------
-    >>> grid = Grid(epsg=0, west_m=-4.0, north_m=4.0, cell_size_m=2.0, rows=4, cols=4)
-    >>> water, known = np.full((1, 4, 4), FULL, dtype=np.uint8), np.full((4, 4), FULL, dtype=np.uint8)
-    >>> water[:, :, 2:] = 0  # in the west
-    >>> seen = np.tile([0.3, 0.3, 0.1, 0.1], (1, 4, 1))
-    >>> view = Evidence.of_probabilities(("water",), seen, cell_size_m=2.0)
-    >>> north, south = (Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg) for yaw_deg in (0.0, 180.0))
-    >>> explained(view, ("water",), Field.of(grid=grid, layers=water, known=known), [north, south]).round(2).tolist()
-    [[0.51], [0.0]]
-    """
-    pool = max(1, round(field.grid.cell_size_m / evidence.cell_size_m))
-    names = [name for name in evidence.classes if name in classes and (evidence.layer(name) != UNKNOWN).any()]
-    layers, at = [evidence.classes.index(name) for name in names], [classes.index(name) for name in names]
-    chances = evidence.probabilities()[layers]
-    is_known = ~np.isnan(chances)
-    bands = np.concatenate((np.where(is_known, chances, 0.0), is_known)).astype(np.float32)
-    summed, frame = squares(bands, pool, cell_size_m=evidence.cell_size_m)
-    seen, known = np.split(summed / pool**2, 2)
-    seen = seen / np.maximum(known, _LEAST)
-    found = np.zeros((len(poses), len(classes)))
-    for row, pose in zip(found, poses, strict=True):
-        under = field.cells.under(between(frame, pose, field.grid), frame.shape)
-        for number, one, weights in zip(at, seen, known * under.band(len(classes)) / FULL, strict=True):
-            row[number] = _explained(one, under.band(number) / FULL, weights)
-    return found
-
-
-def _explained(seen: NDArray[np.floating], mapped: NDArray[np.floating], weights: NDArray[np.floating]) -> float:
-    total = weights.sum()
-    if total < 1:  # no cell
-        return 0.0
-    seen, mapped = (layer - np.vdot(weights, layer) / total for layer in (seen, mapped))
-    by_map, of_seen, of_map = (
-        float(np.vdot(weights, one * two)) for one, two in ((seen, mapped), (seen, seen), (mapped, mapped))
-    )
-    if by_map <= 0:
-        return 0.0
-    return -INDEPENDENT / 2 * math.log1p(-min(by_map**2 / ((of_seen + _FEW) * (of_map + _FEW)), _MOST_ALIKE))
-
-
 @dataclass(frozen=True, kw_only=True)
 class RasterView:
     """A view weighed by gains, in the classes of a map: factors of layers and of known cells, shape (C, rows, cols)."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
@@ -22,7 +23,8 @@ from sasgeo_bench.sasgeo.joint import columns, of_prior
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, explained, read_field, with_unknown_margins
+from sasgeo_bench.sasgeo.overlap import Compared, overlap_of, overlap_weights
+from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, read_field, with_unknown_margins
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
@@ -254,8 +256,25 @@ class Reading:
 
     @cached_property
     def template(self) -> Template:
-        """Return the template of the search."""
+        """Return the template of the gains of Eq. 7."""
         return self.view.scaled(self.reader.model.scaling).template()
+
+    @cached_property
+    def searched(self) -> Template:
+        """Return the template of the search: that of the gains, and of a certain view its overlap with the map."""
+        if not (self._is_sharp and self.reader.switches.searches_overlap):
+            return self.template
+        weights = self.template.weights + overlap_weights(self._read, self.reader.region.classes)
+        return replace(self.template, weights=weights)
+
+    @cached_property
+    def _read(self) -> Evidence:
+        return self.reader.switches.read(self.query.evidence)
+
+    @property
+    def _is_sharp(self) -> bool:
+        """Return whether the view is read as certain, and errors in it hang together."""
+        return self._read.is_certain and self.reader.switches.is_correlated(self.query.evidence)
 
     @property
     def graph(self) -> MappedGraph | None:
@@ -293,19 +312,38 @@ class Reading:
         return None if self.graph is None else verify(self.observed, self.graph, poses, self.reader.model.rules)
 
     def terms(self, poses: Sequence[Pose], verified: Sequence[GraphScore] | None) -> NDArray[np.float64]:
-        """Return terms of Eq. 11 of each pose: see `joint.columns`; of a view with probabilities, two kinds besides.
-
-        They are what the map explains of each class, and what the prior says of heading and scale.
-        """
+        """Return terms of Eq. 11 of each pose, see `joint.columns`, and those of `beside`."""
         scaled, blend = self.by_class(poses) * self.reader.model.scaling, self.reader.model.blend
         graph = None if verified is None else np.array([one.score for one in verified])
         nodes = 0 if graph is None else len(self.observed.nodes)
         terms = columns(scaled, graph, blend, nodes=nodes)
-        switches, seen = self.reader.switches, self.query.evidence
-        if seen.is_certain or not (switches.is_correlated(seen) and switches.reads_probabilities):
+        if self._is_sharp:
+            return np.column_stack((terms, self.beside(poses) * blend.beside))
+        if not self.reader.switches.is_correlated(self.query.evidence):
             return terms
-        by_map = explained(seen, self.reader.region.classes, self.reader.field, poses)
+        by_map = Compared.of(self._read, self.reader.region.classes, self.reader.field, poses).explained
         return np.column_stack((terms, blend.alpha * by_map, blend.alpha * of_prior(poses, self.query.prior)))
+
+    def beside(self, poses: Sequence[Pose]) -> NDArray[np.float64]:
+        """Return our terms of a certain view at each pose before they are weighed, shape (M, 4), 0 where left out.
+
+        They are what the prior says of heading and of scale, how unlike the amounts of the classes are, negative, and
+        the overlap of view and map.
+        """
+        switches, region, found = self.reader.switches, self.reader.region, np.zeros((len(poses), 4))
+        if not self._is_sharp:
+            return found
+        if switches.weighs_prior:
+            found[:, :2] = of_prior(poses, self.query.prior)
+        if switches.weighs_amounts or switches.weighs_overlap != "never":
+            near = None if switches.is_stamped else self.reader.model.likeness[:, 1]
+            compared = Compared.of(self._read, region.classes, self.reader.field, poses, near=near)
+            if switches.weighs_amounts:
+                found[:, 2] = -compared.unlike.sum(axis=1)
+            if switches.weighs_overlap != "never":
+                is_line = np.array([name in load_taxonomy().lines for name in region.classes])
+                found[:, 3] = overlap_of(compared, is_line, is_gated=switches.weighs_overlap == "gated")
+        return found
 
     def sigma_m(self, pose: Pose) -> float:
         """Return the standard deviation of a refined position from the curvature of the raster score, metres."""

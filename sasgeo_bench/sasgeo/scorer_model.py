@@ -19,18 +19,18 @@ from sasgeo_bench.sasgeo.weights import SEASONS, STRATA, by_hand, fit_season
 
 START: Final = 0.01  # default: one cell in a hundred is independent
 _WIDTH: Final = 0.25  # of the prior of an exponent around the common one, in logarithms
-_COMMON_WIDTH: Final = 3.0  # and of the common one
 
 
 def fit_scaling(
-    choices: Sequence[NDArray[np.float64]], *, start: float | Sequence[float] = START
+    choices: Sequence[NDArray[np.float64]], *, start: float | Sequence[float] = START, common_width: float = 3.0
 ) -> NDArray[np.float64]:
     """Fit one exponent for each class, so that the softmax over modes is a calibrated probability.
 
     Scores sum over cells as if these were independent. The score of each class is multiplied by an exponent of its own,
     fitted by conditional logit (McFadden 1974): the probability of the right mode among those of its search is the
     softmax of the sums. Exponents are positive, with a log-normal prior around `start`, times a common factor that is
-    fitted, too: it says how sure the scores are, the rest which classes to trust.
+    fitted, too, with a prior of `common_width` in logarithms: it says how sure the scores are, the rest which classes
+    to trust.
 
     `choices` are the scores by class, shape (M, C), of the modes of each search, the right one first. The result has
     shape (C,).
@@ -67,17 +67,17 @@ def fit_scaling(
         highest = np.maximum.reduceat(sums, starts)
         mass = np.exp(sums - highest[owner])
         total = np.add.reduceat(mass, starts)
-        prior = (_WIDTH * off) @ (_WIDTH * off) + (common / _COMMON_WIDTH) ** 2
+        prior = (_WIDTH * off) @ (_WIDTH * off) + (common / common_width) ** 2
         value = float((np.log(total) + highest).sum() + 0.5 * prior)
         slope = ((mass / total[owner]) @ rows) * exponents + off
-        return value, np.append(slope, common / _COMMON_WIDTH**2 - off.sum())
+        return value, np.append(slope, common / common_width**2 - off.sum())
 
     begin = np.log(np.broadcast_to(np.asarray(start, dtype=np.float64), rows.shape[1:]))
     found = scipy.optimize.minimize(loss, np.append(begin, 0.0), jac=True, method="L-BFGS-B")
     return np.asarray(np.exp(found.x[:-1]))
 
 
-VERSION: Final = 2  # of the text
+VERSION: Final = 3  # of the text
 _DIGITS: Final = 6
 # Arrays of one class in the file, with their shapes.
 _ARRAYS: Final[Mapping[str, tuple[int, ...]]] = {

@@ -18,9 +18,9 @@ from sasgeo_bench.sasgeo.conformal import levels_of
 from sasgeo_bench.sasgeo.graph import GraphScore
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
 from sasgeo_bench.sasgeo.learning import learn
+from sasgeo_bench.sasgeo.overlap import INDEPENDENT
 from sasgeo_bench.sasgeo.raster import (
     CELL_M,
-    INDEPENDENT,
     RasterView,
     likeness_by_hand,
     read_field,
@@ -130,7 +130,7 @@ class SasgeoMatcher:
             return _of_candidates(reading, self.plan, top_k=top_k)
         starts = reading.proposed()
         found = search(
-            self._reader.field, reading.template, query.prior, reading.plan(self.plan), count=LISTED, starts=starts
+            self._reader.field, reading.searched, query.prior, reading.plan(self.plan), count=LISTED, starts=starts
         )
         if not found.modes:
             return WITHHELD
@@ -188,7 +188,7 @@ def _answer(
 def _of_candidates(reading: Reading, plan: Plan, *, top_k: int) -> Match:
     """Rank the candidates of a query; drop those off the map."""
     query = reading.query
-    found, null = rank(reading.reader.field, reading.template, query.prior, query.candidates, reading.plan(plan))
+    found, null = rank(reading.reader.field, reading.searched, query.prior, query.candidates, reading.plan(plan))
     scored = sorted(((at, mode) for at, mode in enumerate(found) if mode is not None), key=lambda item: -item[1].score)
     if not scored:
         return WITHHELD
@@ -248,19 +248,39 @@ _RANKED: Final = (
     "modes of a view with probabilities are ranked, besides, by how well the map explains each class (its correlation, "
     f"as that of {INDEPENDENT:g} independent cells) and by the prior of heading and scale"
 )
+_GAINS: Final = "a view that is certain is searched for and ranked by Eqs. 7-11 alone, as in version 5 of `sasgeo`"
+_SEARCH: Final = (
+    "a view that is certain is searched for by its gains and by its overlap with the map, intersection over union of "
+    "each class to first order"
+)
+_POSE_PRIOR: Final = "the prior of heading and scale"
+_AMOUNTS: Final = "how unlike the amounts of the classes are"
+_OVERLAP: Final = "the overlap of view and map, that of areas as far as no mode overlaps the lines of the view"
 _UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIMITS}"
 
 
-def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS, reads: str = _SOFT) -> MatcherCard:
+_TERMS: Final = (_SEARCH, f"its modes are ranked, besides, by {_POSE_PRIOR}; by {_AMOUNTS}; by {_OVERLAP}")
+
+
+def _card(
+    name: str,
+    title: str,
+    what: str,
+    *ours: str,
+    limits: str = _LIMITS,
+    reads: str = _SOFT,
+    terms: Sequence[str] = _TERMS,
+) -> MatcherCard:
     has_graph = bool({_GRAPH_FITTED, _GRAPH_BY_HAND}.intersection(ours))
     is_soft, is_correlated = reads == _SOFT, _CORRELATED in ours
     ranked = (_RANKED,) if is_soft and is_correlated else ()
+    beside = tuple(terms) if is_correlated else ()
     return MatcherCard(
         name=name,
-        version=str(1 + is_soft + is_correlated + has_graph + len(ranked)),
+        version=str(1 + is_soft + is_correlated + has_graph + len(ranked) + (terms is _TERMS and is_correlated)),
         title=title,
         source=f"SASGeo paper (Trukhina and Vashkelis), {what}",
-        ours="; ".join((_OURS, reads, *ranked, *ours)),
+        ours="; ".join((_OURS, reads, *ranked, *beside, *ours)),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         limits=limits,
@@ -516,3 +536,108 @@ class SasgeoHard(LearningMatcher):
         "probabilities are worth",
     )
     switches = Switches(reads_probabilities=False)
+
+
+class SasgeoGains(LearningMatcher):
+    """The whole scorer without the terms that are ours."""
+
+    card = _card(
+        "sasgeo_gains",
+        "SASGeo by its gains alone",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _CORRELATED,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=_UNTAUGHT,
+        terms=(_GAINS,),
+    )
+    switches = Switches(searches_overlap=False, weighs_prior=False, weighs_amounts=False, weighs_overlap="never")
+
+
+class SasgeoGainsSearch(LearningMatcher):
+    """The whole scorer whose search knows no overlap."""
+
+    card = _card(
+        "sasgeo_gains_search",
+        "SASGeo that searches by its gains alone",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _CORRELATED,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=_UNTAUGHT,
+        terms=("a view that is certain is searched for by its gains alone", _TERMS[1]),
+    )
+    switches = Switches(searches_overlap=False)
+
+
+class SasgeoNoPosePrior(LearningMatcher):
+    """The whole scorer that takes all headings and scales for alike."""
+
+    card = _card(
+        "sasgeo_no_pose_prior",
+        "SASGeo without the prior of heading and scale",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _CORRELATED,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=_UNTAUGHT,
+        terms=(_SEARCH, f"its modes are ranked, besides, by {_AMOUNTS}; by {_OVERLAP}"),
+    )
+    switches = Switches(weighs_prior=False)
+
+
+class SasgeoNoAmounts(LearningMatcher):
+    """The whole scorer that asks where a class lies, not how much of it there is."""
+
+    card = _card(
+        "sasgeo_no_amounts",
+        "SASGeo without the amounts of the classes",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _CORRELATED,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=_UNTAUGHT,
+        terms=(_SEARCH, f"its modes are ranked, besides, by {_POSE_PRIOR}; by {_OVERLAP}"),
+    )
+    switches = Switches(weighs_amounts=False)
+
+
+class SasgeoNoOverlap(LearningMatcher):
+    """The whole scorer that searches for overlap, and does not rank by it."""
+
+    card = _card(
+        "sasgeo_no_overlap",
+        "SASGeo that ranks without overlap",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _CORRELATED,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=_UNTAUGHT,
+        terms=(_SEARCH, f"its modes are ranked, besides, by {_POSE_PRIOR}; by {_AMOUNTS}; not by the overlap"),
+    )
+    switches = Switches(weighs_overlap="never")
+
+
+class SasgeoOverlapAlways(LearningMatcher):
+    """The whole scorer for which areas count as much as lines, however well these are seen."""
+
+    card = _card(
+        "sasgeo_overlap_always",
+        "SASGeo, the overlap of areas always counts",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        _CORRELATED,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=_UNTAUGHT,
+        terms=(
+            _SEARCH,
+            f"its modes are ranked, besides, by {_POSE_PRIOR}; by {_AMOUNTS}; by the overlap of all classes alike",
+        ),
+    )
+    switches = Switches(weighs_overlap="always")

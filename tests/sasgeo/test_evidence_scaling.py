@@ -35,3 +35,11 @@ def test_nothing_and_different_classes_are_refused():
         fit_scaling([])
     with pytest.raises(ConfigError, match="different classes"):
         fit_scaling([np.ones((2, 3)), np.ones((2, 4))])
+
+
+def test_views_that_any_weight_tells_apart_do_not_run_off():
+    separable = [np.array([[30.0, 4.0], [0.0, 0.0], [-5.0, 1.0]])] * 18
+    tame, wild = (fit_scaling(separable, start=(0.01, 0.05), common_width=width) for width in (0.5, 3.0))
+    assert (wild > 2 * tame).all()
+    assert tame[0] / tame[1] == pytest.approx(0.01 / 0.05, rel=0.5)
+    assert (tame < 6 * np.array([0.01, 0.05])).all()

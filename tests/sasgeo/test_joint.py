@@ -9,7 +9,9 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.sasgeo.joint import HALF_NODES, Blend, columns, contradiction, of_prior
 
 
-@pytest.mark.parametrize(("name", "value"), [("alpha", -1.0), ("beta", float("nan")), ("eta", float("inf"))])
+@pytest.mark.parametrize(
+    ("name", "value"), [("alpha", -1.0), ("beta", float("nan")), ("eta", float("inf")), ("overlap", -0.1)]
+)
 def test_weights_that_turn_a_term_around_are_refused(name, value):
     with pytest.raises(ConfigError, match=name):
         Blend(**{name: value})

@@ -8,16 +8,12 @@ import pytest
 import shapely
 from affine import Affine
 from rasterio.features import rasterize
-from scipy.ndimage import map_coordinates
 
-from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence, LayerBits, cell_offsets_m, observe
-from sasgeo_bench.sasgeo.ablations import Switches
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.raster import (
-    INDEPENDENT,
     REPEATED,
     RasterView,
     burnt,
-    explained,
     likeness_by_hand,
     line_width_m,
     read_field,
@@ -25,11 +21,9 @@ from sasgeo_bench.sasgeo.raster import (
     with_unknown_margins,
 )
 from sasgeo_bench.sasgeo.rates import hand_rates
-from sasgeo_bench.sasgeo.reading import Reader
-from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import STRATA, even_gains, likelihood_gains
 from sasgeo_bench.search import stored
-from sasgeo_bench.search.field import FULL, Field
+from sasgeo_bench.search.field import FULL
 from sasgeo_bench.search.find import score_at, search
 from sasgeo_bench.tasks.vectors import vector_table
 
@@ -225,74 +219,3 @@ def test_a_map_on_disk_is_the_one_read_into_memory(tiny, tmp_path, monkeypatch, 
         np.testing.assert_array_equal(found.level(factor).cells.fours, whole.level(factor).cells.fours)
     again = store_field(tiny.folder / "regions" / tiny.region.manifest.id, tmp_path / "map", near, trust=trust)
     assert again == found
-
-
-@pytest.fixture(scope="module")
-def widest(asked):
-    """The view that shows most, and its place."""
-    return max(asked, key=lambda pair: pair[0].evidence.shape)
-
-
-def faint(query, region, pose, *, noise=0.1):
-    """The map under a pose as probabilities that nowhere reach a half, with errors."""
-    seen = observe(LayerBits.of(region.layers), region.grid, pose, size_cells=query.evidence.shape[0], cell_size_m=1.0)
-    chances = 0.1 + 0.3 * (seen == PRESENT) + np.random.default_rng(1).normal(0, noise, seen.shape)
-    chances[seen == UNKNOWN] = np.nan
-    return Evidence.of_probabilities(region.classes, chances.clip(0, 1), cell_size_m=1.0)
-
-
-def test_what_the_map_explains_is_the_correlation_of_its_cells(tiny, field, widest):
-    query, pose = widest
-    view = faint(query, tiny.region, pose)
-    found = explained(view, tiny.region.classes, field, [pose])[0]
-    pooled = view.probabilities().reshape(len(view.classes), view.shape[0] // 2, 2, view.shape[1] // 2, 2)
-    offsets_m = cell_offsets_m((view.shape[0] // 2, view.shape[1] // 2), 2.0)
-    cols, rows = field.grid.to_uv(pose.to_map(offsets_m.reshape(-1, 2))).T - 0.5
-    for number, one in enumerate(pooled.mean(axis=(2, 4))):
-        under = map_coordinates(field.layers[number].astype(float) / FULL, [rows, cols], order=1)
-        of_seen, of_map = (layer - layer.mean() for layer in (one.ravel(), under))
-        spreads = (of_seen @ of_seen + 2) * (of_map @ of_map + 2)  # two cells' worth
-        by_hand = -INDEPENDENT / 2 * np.log(1 - max(of_seen @ of_map, 0) ** 2 / spreads)
-        assert found[number] == pytest.approx(by_hand, rel=0.03, abs=0.01)
-    assert (found > 1).sum() > 1
-
-
-def test_more_that_is_mapped_and_not_seen_explains_less(tiny, field, widest):
-    query, pose = widest
-    view = faint(query, tiny.region, pose)
-    clearest = explained(view, tiny.region.classes, field, [pose])[0].argmax()
-    crowded = field.layers
-    crowded[clearest, ::3] = FULL
-    fields = (field, Field.of(grid=field.grid, layers=crowded, known=field.known))
-    before, after = (explained(view, tiny.region.classes, each, [pose])[0, clearest] for each in fields)
-    assert after < 0.7 * before
-
-
-def test_unknown_cells_and_classes_that_the_map_lacks_explain_nothing(tiny, field, widest):
-    query, pose = widest
-    view = faint(query, tiny.region, pose)
-    chances = view.probabilities()
-    chances[:, :, view.shape[1] // 2 :] = np.nan
-    half = Evidence.of_probabilities(view.classes, chances, cell_size_m=1.0)
-    chances[:, :, view.shape[1] // 2 :] = np.random.default_rng(2).random(chances[:, :, view.shape[1] // 2 :].shape)
-    noisy = Evidence.of_probabilities(view.classes, chances, cell_size_m=1.0)
-    of_half, of_noisy = (explained(each, tiny.region.classes, field, [pose]).sum() for each in (half, noisy))
-    assert of_half > 1.5 * of_noisy
-    none = Evidence.of_probabilities(("tram",), np.full((1, 8, 8), 0.5), cell_size_m=1.0)
-    silent = Evidence.of_probabilities(view.classes, np.full(chances.shape, np.nan), cell_size_m=1.0)
-    for each in (none, silent):
-        assert not explained(each, tiny.region.classes, field, [pose]).any()
-
-
-def test_a_view_that_is_certain_has_the_terms_of_the_paper_alone(tiny, widest):
-    query, pose = widest
-    count = len(tiny.region.classes)
-    model = ScorerModel.by_hand(tiny.region.classes)
-    seen = replace(query, evidence=faint(query, tiny.region, pose))
-    for switches, of_faint in ((Switches(), 2 * count + 2), (Switches(reads_probabilities=False), count)):
-        reader = Reader.of(tiny.region, model, switches)
-        for view, columns in ((query, count), (seen, of_faint)):
-            terms = reader.read(view).terms([pose], None)
-            assert terms.shape == (1, columns)
-            classes = reader.read(view).by_class([pose]) * model.scaling
-            assert (terms[:, :count] == classes).all()

@@ -53,8 +53,8 @@ def test_classes_are_put_in_the_order_of_a_map_and_unknown_ones_are_by_hand():
     [
         ("", "cannot be read"),
         ("[]", "cannot be read"),
-        ('{"version": 2}', "'classes'"),
-        ('{"version": 1, "classes": {}}', "version 1, this program reads 2"),
+        ('{"version": 3}', "'classes'"),
+        ('{"version": 1, "classes": {}}', "version 1, this program reads 3"),
         (drawn(gate_m=-1.0), "gate_m of the graph is out of range"),
         (drawn(wander=1.0), "wander of the graph is out of range"),
         (drawn(degrees=[0.0]), "ratios of degrees"),

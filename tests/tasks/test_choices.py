@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import open_numbers
+from benchmarks import joint_trials, open_numbers
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 
@@ -16,6 +16,7 @@ WORLD = read_split_file(find_split_file("world"))
 TRIALS = read_split_file(find_split_file("trials"))
 TRAIN = {region: place.country for place in WORLD.place if place.part == "train" for region in place.region_ids}
 LARGE_M2 = 5e6
+STORED = ROOT / "docs" / "results" / "joint-trials.csv"
 
 
 def read(pipeline):
@@ -34,6 +35,8 @@ def asked_by(pipeline):
         ("the split of trials", TRIALS.region_ids),
         ("open numbers", open_numbers.places()),
         ("trials of the scorer", asked_by(read("scorer-trials"))),
+        ("trials of the joint score", joint_trials.DATED),
+        ("joint-trials.csv", {one.place for one in joint_trials.read_answers(STORED)}),
         *(
             (path, open_numbers.read_trials(ROOT / "docs" / "results" / path)[0].right_of)
             for path in ("open-numbers.csv", "scorer-trials.csv")

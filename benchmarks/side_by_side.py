@@ -160,7 +160,7 @@ ROWS: Final = (
     scored(20, 50_000),
     Row(
         name="enter demo",
-        words=("enter", f"{KEPT}/results/demo", "--matcher", "polar", "--out", FRESH, "--into", f"{FRESH}/mine"),
+        words=("enter", f"{KEPT}/results/demo", "--matcher", "polar_vsc", "--out", FRESH, "--into", f"{FRESH}/mine"),
         first=(("leaderboard", "demo", "--out", KEPT, "--results", f"{KEPT}/results"),),
         goal=0.3,
     ),

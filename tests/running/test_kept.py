@@ -306,7 +306,7 @@ def test_a_maker_that_is_stopped_leaves_nothing_and_says_why(number, is_swallowe
     order = {"region": str(region), "wanted": [wanted], "code": kept.code_hash()}
     program = (
         "import os, signal; from contextlib import suppress; from sasgeo_bench.running import keeper\n"
-        "keeper._AGAIN_S = 0.01\n"
+        f"keeper._AGAIN_S = 0.01; signal.signal(signal.{number}, signal.SIG_DFL)\n"  # the tests may run by `nohup`
         "def make(_, into):\n"
         f"    with suppress({'SystemExit' if is_swallowed else ''}):\n"
         f"        (into / 'a').touch(); os.kill(os.getpid(), signal.{number})\n"

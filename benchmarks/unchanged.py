@@ -165,8 +165,10 @@ def _columns(name: str, table: pd.DataFrame, *, is_measured: bool) -> Prints:
 
 def _is_near(name: str, before: Path, after: Path, *, tolerance: float) -> bool:
     """Return whether a column, by the name of its fingerprint, holds nearly the same numbers in two folders."""
-    kind, path, *of_matcher, column = name.split(": ")
-    if kind != "table" or not all((root / path).is_file() for root in (before, after)):
+    if not name.startswith("table: "):
+        return False
+    path, *of_matcher, column = name.split(": ")[1:]
+    if not all((root / path).is_file() for root in (before, after)):
         return False
     tables = [pd.read_parquet(root / path) for root in (before, after)]
     if of_matcher:

@@ -155,7 +155,7 @@ def test_code_and_libraries_of_other_versions_are_another_program(tmp_path, monk
     __import__("sasgeo_like")
     before = of_program("limit = 1")
     compiled = path.parent / "__pycache__" / "rule.cpython-311.pyc.140234"  # while another process writes it
-    compiled.parent.mkdir()
+    compiled.parent.mkdir(exist_ok=True)
     compiled.touch()
     assert before == of_program("limit = 1")
     assert of_program("limit = 2", changed_s=time.time() + 1) is None  # since this process began

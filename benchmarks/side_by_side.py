@@ -177,7 +177,7 @@ ROWS: Final = (
             "--out",
             FRESH,
             "--into",
-            f"{FRESH}/it",
+            f"{FRESH}/entrant",
         ),
         first=(("leaderboard", "demo", "--out", KEPT, "--results", f"{KEPT}/results"),),
         goal=0.3,

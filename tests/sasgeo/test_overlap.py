@@ -20,18 +20,6 @@ from sasgeo_bench.search.find import score_at
 
 
 @pytest.fixture(scope="module")
-def field(tiny):
-    return read_field(tiny.region, likeness_by_hand(tiny.region.classes))
-
-
-@pytest.fixture(scope="module")
-def asked(tiny):
-    """Views whose places are on the map, and these."""
-    pairs = zip(tiny.queries, tiny.truths, strict=True)
-    return [(query, truth.pose) for query, truth in pairs if truth.pose is not None and query.suite == "clean"]
-
-
-@pytest.fixture(scope="module")
 def widest(asked):
     """The view that shows most, and its place."""
     return max(asked, key=lambda pair: pair[0].evidence.shape)

@@ -28,18 +28,6 @@ from sasgeo_bench.search.find import score_at, search
 from sasgeo_bench.tasks.vectors import vector_table
 
 
-@pytest.fixture(scope="module")
-def field(tiny):
-    return read_field(tiny.region, likeness_by_hand(tiny.region.classes))
-
-
-@pytest.fixture(scope="module")
-def asked(tiny):
-    """Views whose places are on the map, and these."""
-    pairs = zip(tiny.queries, tiny.truths, strict=True)
-    return [(query, truth.pose) for query, truth in pairs if truth.pose is not None and query.suite == "clean"]
-
-
 def gains_of(region):
     shares = zip(region.classes, (region.layers == PRESENT).mean(axis=(1, 2)), strict=True)
     return likelihood_gains([replace(hand_rates(name), mapped=share) for name, share in shares], age_years=0.0)

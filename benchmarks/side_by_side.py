@@ -7,10 +7,10 @@
 Checks both commits out below `--into`, makes an environment for each by its own `make install`, and runs each row in
 each of them in turn, base first: A B A B. What a row needs (regions, tasks) each commit makes for itself, once. Seconds
 are by the clock, `CPU s` are of a command and of all that it waited for, memory is that of its largest process; rows of
-`profile` give what it measured of the matcher, that of Andorra what `search_countries.py` prints. A ratio is head over
-base. Other load is in the seconds of both alike, and least in `CPU s`: quote ratios of one run. A row that one of the
-commits cannot carry out says so; rows that were measured are kept, and the same command goes on with the others. Needs
-the extracts of Liechtenstein, Andorra and the Faroes in a folder that SASGEO_EXTRACTS names.
+`profile` give what it measured of the matcher, those of Andorra and of made-up answers what the program prints. A ratio
+is head over base. Other load is in the seconds of both alike, and least in `CPU s`: quote ratios of one run. A row that
+one of the commits cannot carry out says so; rows that were measured are kept, and the same command goes on with the
+others. Needs the extracts of Liechtenstein, Andorra and the Faroes in a folder that SASGEO_EXTRACTS names.
 """
 
 import argparse
@@ -126,10 +126,23 @@ def of_country(_: Path, said: str) -> dict[str, float]:
     return {name: float(text) for name, text in (names | {"stored in s": stored[1], "CPU s": stored[2]}).items()}
 
 
+def of_scores(_: Path, said: str) -> dict[str, float]:
+    r"""Return the figures that `score.py` prints of the whole command, then of intervals and ranks alone.
+
+    >>> of_scores(Path(), "a run\n| 10 | 100 | 1.0 | 2.0 | 300 | 4.0 | 5.0 | 600 |")["MB"]
+    600.0
+    """
+    row = next(line for line in reversed(said.splitlines()) if line[:1] == "|")
+    cells = [float(cell) for cell in row.strip("|\n ").split("|")]
+    names = ("ranks s", "ranks CPU s", "ranks MB", "s", "CPU s", "MB")
+    found = dict(zip(names, cells[2:], strict=True))
+    return {name: found[name] for name in (*names[3:], *names[:3])}
+
+
 def scored(matchers: int, queries: int) -> Row:
-    """Return the row that scores made-up answers with rejectors and all figures."""
+    """Return the row that scores made-up answers with rejectors and all figures; they are made up once."""
     words = ("benchmarks/score.py", "--sizes", f"{matchers}x{queries}", "--runs", "1", "--keep", f"{KEPT}/made-up")
-    return Row(name=f"score {matchers * queries:,} rows", words=words, first=(words,), goal=0.3)
+    return Row(name=f"score {matchers * queries:,} rows", words=words, goal=0.3, gives=of_scores)
 
 
 ROWS: Final = (

@@ -51,7 +51,7 @@ _NEWER: Final[Mapping[str, Mapping[str, object]]] = {
     "pilot": {"control": None, "spread": None},
     "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR, "segmenters": [], "regions": []},
     "paper": {"crop_readings": []},
-    "learning": {"detector": PUBLISHED, "kinds": []},
+    "learning": {"detector": PUBLISHED, "kinds": [], "models": 1},
 }
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
@@ -59,7 +59,7 @@ SegmenterName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}(\+share
 
 
 class PilotSpec(Document):
-    """What is known of a contrast from train places; see `scoring.registration.Pilot`."""
+    """What is known of a contrast from train places; see `scoring.contrasts.Pilot`."""
 
     second: Annotated[float, Field(ge=-1, le=1)] | None = None  # of a difference it may be below 0
     control: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -224,6 +224,9 @@ class LearningSpec(Document):
     Matchers learn from views of one `detector`, so that views of another one show what a shift costs; and under stress
     only from `kinds`, as they begin, all if empty. Views without stress always count.
 
+    Of several `models` each learns from a draw of its own of the views, and answers in some of the countries: so the
+    luck of training is in differences between countries, and in their intervals.
+
     >>> LearningSpec(suites=["clean"]).most
     200
     """
@@ -233,6 +236,7 @@ class LearningSpec(Document):
     oracles: list[str] = []
     detector: Detector = PUBLISHED
     kinds: list[Short] = []
+    models: Annotated[int, Field(ge=1, le=20)] = 1
 
 
 class ReferenceImagerySpec(Document):

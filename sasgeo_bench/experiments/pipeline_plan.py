@@ -39,12 +39,14 @@ _NOT_TRAINED: Final = ("calibration", "test")
 class TrainingGroup:
     """Task folders that a matcher is asked in one run, and those it learns from before; none if it stays untaught.
 
-    `name` is the half in a cross-fit, "held out" in a hold-out.
+    `name` is the half in a cross-fit, "held out" in a hold-out, and which of several models answers; `model` is its
+    number, from 0.
     """
 
     name: str
     asked: tuple[Path, ...]
     train: tuple[Path, ...]
+    model: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,20 +62,30 @@ class TrainingGroups:
 
         In a cross-fit each half is asked after learning from the other. In a hold-out all that is not for training is
         asked after learning from the train places. Tasks of no place, as the paper's, are asked untaught. A sealed
-        place never trains.
+        place never trains. Of several models each is asked in countries of its own (`models_by_place`); an oracle has
+        one.
         """
         groups = {task: self._group_of(task) for task in tasks}
         names = [HELD_OUT] if is_holdout(self.split) else [f"half {half}" for half in HALVES]
         none = f"no {'part' if is_holdout(self.split) else 'half'}"
+        count = 1 if is_oracle else self.learning.models
+        model_of = {task: self._model_of(task, count) for task in asked}
         found = [
             TrainingGroup(
-                name=name or none,
-                asked=tuple(task for task in asked if groups[task] == name),
+                name=(name or none) + (f", model {model + 1} of {count}" if name and count > 1 else ""),
+                asked=tuple(task for task in asked if groups[task] == name and (not name or model_of[task] == model)),
                 train=tuple(task for task in tasks if name and self._teaches(task, groups[task], name, is_oracle)),
+                model=model,
             )
             for name in (*names, None)
+            for model in range(count if name else 1)
         ]
         return [group for group in found if group.asked]
+
+    def _model_of(self, task: Path, count: int) -> int:
+        """Return the model that answers a task; the first those of no place, as controls are."""
+        models = models_by_place(self.split, count)
+        return next((models[place] for place in self.split.places_in(base_of(task.name))), 0)
 
     def _teaches(self, task: Path, group: str | None, name: str, is_oracle: bool) -> bool:  # noqa: FBT001
         """Return whether a task trains for a group of places."""
@@ -101,6 +113,8 @@ class TrainingGroups:
             how = "calibration and test places are asked after learning from train places"
             own = "calibration and test places themselves"
         lines = [f"  learning: {how} ({suites}, at most {most} queries)"]
+        if self.learning.models > 1:
+            lines.append(f"    {self.learning.models} models, each of a draw of its own: countries take turns")
         for part in ("train", *_NOT_TRAINED) if is_holdout(self.split) else ():
             places = _places_of(part, requests, self.split)
             lines.append(f"    {part}: {named(places, 'place') if places else 'no place'}")
@@ -111,6 +125,21 @@ class TrainingGroups:
         if self.learning.oracles:
             lines.append(f"    {', '.join(self.learning.oracles)}: from {own}, never ranked")
         return lines
+
+
+def models_by_place(split: Split, count: int) -> dict[str, int]:
+    """Return which of some models answers at each place: countries of a part, or of a half, take turns, largest first.
+
+    All places of a country have one model, so that its luck is that of the country.
+    """
+    found: dict[str, int] = {}
+    part_of = {place.name: place.part or place.half or "" for place in split.spec.place}
+    for part in sorted(set(part_of.values())):
+        places = [name for name, own in part_of.items() if own == part]
+        sizes = Counter(split.country_of[name] for name in places)
+        turn = {country: at % count for at, country in enumerate(sorted(sizes, key=lambda one: (-sizes[one], one)))}
+        found |= {name: turn[split.country_of[name]] for name in places}
+    return found
 
 
 def is_holdout(split: Split) -> bool:
@@ -598,11 +627,12 @@ def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]
         return [Run(name="", plan=whole)]
     learning = groups.learning
     lessons = Lessons(detector=learning.detector, kinds=tuple(learning.kinds))
-    request = replace(whole.request, most_trained=learning.most, lessons=lessons, split=groups.split)
-    return [
-        Run(name=group.name, plan=plan_run(replace(request, tasks=group.asked, train=group.train)))
-        for group in groups.of(own, tasks, is_oracle=is_oracle)
-    ]
+    request = replace(whole.request, most_trained=learning.most, split=groups.split)
+    runs = []
+    for group in groups.of(own, tasks, is_oracle=is_oracle):
+        taught = replace(request, tasks=group.asked, train=group.train, lessons=replace(lessons, draw=group.model))
+        runs.append(Run(name=group.name, plan=plan_run(taught)))
+    return runs
 
 
 def is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:

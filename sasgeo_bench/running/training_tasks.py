@@ -62,12 +62,15 @@ class _Pair:
 class Lessons:
     """The views that may be learned from: of one detector, and under stress only of some kinds, as they begin; or all.
 
+    Where there are more than are used, another `draw` chooses others.
+
     >>> Lessons(kinds=("S1",)).kinds
     ('S1',)
     """
 
     detector: Detector = PUBLISHED
     kinds: tuple[str, ...] = ()
+    draw: int = 0
 
     def hold(self, truth: Truth) -> bool:
         """Return whether a view may be learned from; views without stress are of every kind."""
@@ -90,7 +93,8 @@ def plan_training(
     """Choose at most `most` pairs, evenly over places, then suites, then sites, by a hash of their names.
 
     `train` and `asked` are task folders. `split` defines places and how far apart they must lie; without one, regions
-    are places. Only views that `lessons` hold are used, those of the published detector unless given.
+    are places. Only views that `lessons` hold are used, those of the published detector unless given, and their draw
+    says which.
 
     Raises
     ------
@@ -113,7 +117,8 @@ def plan_training(
         raise ConfigError(
             f"{first}, to learn from, holds no queries {chosen_by.to_text()}: there is nothing to learn from"
         )
-    chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
+    keys = (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site)
+    chosen = spread(pairs, keys, draw=chosen_by.draw)[:most]
     ids: dict[Path, list[str]] = {}
     for pair in chosen:
         ids.setdefault(pair.task.folder, []).append(pair.query_id)
@@ -209,14 +214,19 @@ def _pairs_of(task: Task, split: Split | None, lessons: Lessons) -> Iterator[_Pa
         )
 
 
-def spread(pairs: Sequence[_Pair], by: Sequence[Callable[[_Pair], str]]) -> list[_Pair]:
-    """Order pairs so that every beginning is spread evenly, first by the first key; hashes of names break ties."""
+def spread(pairs: Sequence[_Pair], by: Sequence[Callable[[_Pair], str]], *, draw: int = 0) -> list[_Pair]:
+    """Order pairs so that every beginning is spread evenly, first by the first key; hashes of names break ties.
+
+    Another `draw` has other hashes.
+    """
+    salt = f"draw {draw}/" if draw else ""
     if not by:
-        return sorted(pairs, key=lambda pair: _rank(pair.query_id))
+        return sorted(pairs, key=lambda pair: _rank(salt + pair.query_id))
     groups: dict[str, list[_Pair]] = {}
     for pair in pairs:
         groups.setdefault(by[0](pair), []).append(pair)
-    lines = [spread(groups[name], by[1:]) for name in sorted(groups, key=_rank)]
+    names = sorted(groups, key=lambda name: _rank(salt + name))
+    lines = [spread(groups[name], by[1:], draw=draw) for name in names]
     return [pair for row in zip_longest(*lines) for pair in row if pair is not None]
 
 

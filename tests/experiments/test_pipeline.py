@@ -3,6 +3,7 @@
 
 import datetime as dt
 import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from sasgeo_baselines.rejectors.margin import Margin
 
 from sasgeo_bench.boards.pipeline_spec import (
+    LearningSpec,
     PipelineFile,
     find_pipeline_file,
     list_pipeline_files,
@@ -21,12 +23,13 @@ from sasgeo_bench.core.errors import ConfigError, MatchError
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.experiments import pipeline, pipeline_plan
 from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import is_asked, plan_pipeline
+from sasgeo_bench.experiments.pipeline_plan import TrainingGroups, is_asked, models_by_place, plan_pipeline
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.tasks import build as tasks
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks
 from sasgeo_bench.tasks.query import CONTROLS
+from sasgeo_bench.tasks.split import find_split
 from tests.handmade import split_file
 from tests.threaded import threaded
 
@@ -532,6 +535,38 @@ def test_a_half_without_a_place_is_told_before_anything_is_asked(tmp_path):
     ]
 
 
+def test_of_several_models_each_is_asked_in_countries_of_its_own():
+    split, crossfit = find_split("world"), find_split("crossfit")
+    tasks = [Path("out/tasks/clean") / name for name in split.spec.region_ids]
+    learning = LearningSpec(suites=["clean"], models=3)
+    found = TrainingGroups(split=split, controls=crossfit, learning=learning).of(tasks, tasks, is_oracle=False)
+    assert [group.name for group in found][:3] == [f"held out, model {at} of 3" for at in (1, 2, 3)]
+    assert len({group.train for group in found if group.name.startswith("held out")}) == 1
+    model_of = models_by_place(split, 3)
+    of_country = {(split.country_of[name], model) for name, model in model_of.items()}
+    assert len(of_country) == len(set(split.country_of.values()))  # one model each
+    for part in ("calibration", "test"):
+        sizes = Counter(model for name, model in model_of.items() if split.part_of(name) == part)
+        assert len(sizes) == 3
+        assert min(sizes.values()) > sum(sizes.values()) / 6
+    asked = [task for group in found if group.name.startswith("held out") for task in group.asked]
+    assert len(asked) == len(set(asked))
+    one = TrainingGroups(split=split, controls=crossfit, learning=LearningSpec(suites=["clean"]))
+    assert set(one.of(tasks, tasks, is_oracle=False)[0].asked) == set(asked)
+
+
+def test_of_several_models_in_a_cross_fit_each_half_has_its_own():
+    split = find_split("crossfit")
+    tasks = [Path("out/tasks/clean") / name for name in split.spec.region_ids]
+    groups = TrainingGroups(split=split, controls=split, learning=LearningSpec(suites=["clean"], models=2))
+    found = groups.of(tasks, tasks, is_oracle=False)
+    assert [group.name for group in found] == [f"half {half}, model {at} of 2" for half in "ab" for at in (1, 2)]
+    assert [group.model for group in found] == [0, 1, 0, 1]
+    assert sorted(task for group in found for task in group.asked) == sorted(tasks)
+    oracle = groups.of(tasks, tasks, is_oracle=True)
+    assert [group.name for group in oracle] == ["half a", "half b"]
+
+
 def test_a_key_that_is_newer_than_a_file_leaves_its_hash_as_it_was():
     assert small().sha256 == "9776e35b91281bb01fef8fc443a2ccf8787e231e33617e88657f853beb9acb0e"
     metric = '[[contrast]]\nmetric = "interaction"'
@@ -544,10 +579,11 @@ def test_a_key_that_is_newer_than_a_file_leaves_its_hash_as_it_was():
     ]
     assert len({spec.sha256 for spec in (small(), one, other, *changed)}) == 5
     both = LEARNING.replace("[[task]]", '[[task]]\ndetectors = ["published", "measured"]')
-    lines = ("", 'detector = "published"', "kinds = []", 'detector = "measured"', 'kinds = ["S1"]')
-    taught = [taught_by(line, both).sha256 for line in lines]
-    assert taught[0] == taught[1] == taught[2]
-    assert len(set(taught)) == 3  # another detector, and other kinds
+    usual = ("", 'detector = "published"', "kinds = []", "models = 1")
+    others = ('detector = "measured"', 'kinds = ["S1"]', "models = 2")
+    taught = [taught_by(line, both).sha256 for line in (*usual, *others)]
+    assert len(set(taught[: len(usual)])) == 1
+    assert len(set(taught)) == 1 + len(others)
 
 
 def test_who_learns_of_a_detector_needs_views_of_it():

@@ -219,6 +219,16 @@ def test_a_training_set_is_the_same_whatever_order_its_tasks_are_named_in(tasks)
     assert plan_training(train, asked=[], split=None, most=8).sha256 != found[0].sha256
 
 
+def test_another_draw_of_a_training_set_is_as_even_and_holds_other_views(tasks):
+    train = sorted((tasks / "tasks").glob("*/town*"))
+    found = [plan_training(train, asked=[], split=None, most=7, lessons=Lessons(draw=draw)) for draw in (0, 1, 2)]
+    assert found[0] == plan_training(train, asked=[], split=None, most=7)
+    assert len({one.sha256 for one in found}) == 3
+    assert {(one.count, one.places) for one in found} == {(7, ("town-grid", "town-riverside"))}
+    whole = [plan_training(train, asked=[], split=None, most=2000, lessons=Lessons(draw=draw)) for draw in (0, 1)]
+    assert whole[0] == whole[1]  # there is but one choice of all
+
+
 def test_matchers_learn_under_stress_from_some_kinds_alone(tasks):
     (task,) = (tasks / "tasks" / "alias").glob("town-grid*")
     truths = task_files.Task.open(task).truths

@@ -24,12 +24,12 @@ class Switches:
     matcher that does not learn has rates set by hand. `is_unknown_silent` ignores unknown cells of the view, else they
     count as absent. `has_graph` ranks modes with Eq. 9, too. `is_distinctive`, Eq. 6, gives rare configurations more
     weight. `is_stamped`, Eq. 5 for each feature, weighs features by the time since their last edit. Unless it
-    `knows_age`, every map counts as new, which separates stability from fitted weights. Unless it `learns_from_old`,
-    training views on an older map are moved to the map of their own day. `burns_vectors` reads the perceived vectors as
-    a second raster view, so that an arm without a graph sees what one with a graph sees. `correlates` says when errors
-    of a class are taken to hang together ("faint": in views with probabilities), else each cell counts alone: see
-    `raster.RasterView.levelled` and `damped`. `reads_probabilities` of views that have some, else each cell is the
-    likelier of present and absent.
+    `knows_age`, every map counts as new, which separates stability from fitted weights. Unless it `knows_season`, every
+    view is weighed as one of no season. Unless it `learns_from_old`, training views on an older map are moved to the
+    map of their own day. `burns_vectors` reads the perceived vectors as a second raster view, so that an arm without a
+    graph sees what one with a graph sees. `correlates` says when errors of a class are taken to hang together ("faint":
+    in views with probabilities), else each cell counts alone: see `raster.RasterView.levelled` and `damped`.
+    `reads_probabilities` of views that have some, else each cell is the likelier of present and absent.
 
     The last four are of certain views in which errors hang together. `searches_overlap` adds the overlap of view and
     map to the template of the search, so that its list holds places that gains alone miss. `weighs_prior`,
@@ -43,6 +43,7 @@ class Switches:
     is_distinctive: bool = False
     is_stamped: bool = False
     knows_age: bool = True
+    knows_season: bool = True
     learns_from_old: bool = True
     burns_vectors: bool = False
     correlates: Correlated = "always"
@@ -76,5 +77,5 @@ class Switches:
         if self.weights == "even":
             return even_gains(np.ones(len(model.classes)))
         age_years = age_years if self.knows_age else 0.0
-        persists = model.persists(season).tolist()
+        persists = model.persists(season if self.knows_season else "").tolist()
         return likelihood_gains(model.rates, age_years=age_years, persists=persists).softened(model.missed_share)

@@ -287,6 +287,14 @@ def _card(
     )
 
 
+def _whole(
+    name: str, title: str, *ours: str, limits: str = _UNTAUGHT, reads: str = _SOFT, terms: Sequence[str] = _TERMS
+) -> MatcherCard:
+    """Return the card of the whole scorer, taught, with something changed."""
+    told = (_FITTED, _CORRELATED, *ours, _GRAPH_FITTED, _SILENT)
+    return _card(name, title, "Eqs. 5, 7-9, 11-14", *told, limits=limits, reads=reads, terms=terms)
+
+
 class SasgeoRaster(SasgeoMatcher):
     """Raster alone, uniform weights."""
 
@@ -403,33 +411,33 @@ class SasgeoDistinct(LearningMatcher):
 class SasgeoAgeless(LearningMatcher):
     """The whole scorer without the age of the map."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_ageless",
         "SASGeo without the age of the map",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
         "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights; its "
         "exponents are learnt on old maps too",
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
     )
     switches = Switches(knows_age=False)
+
+
+class SasgeoSeasonless(LearningMatcher):
+    """The whole scorer for which all seasons are alike."""
+
+    card = _whole(
+        "sasgeo_seasonless",
+        "SASGeo without the season",
+        "a view of winter is weighed as one of no known season is: d_season of Eq. 5 is 1",
+    )
+    switches = Switches(knows_season=False)
 
 
 class SasgeoFresh(LearningMatcher):
     """The whole scorer, trained on maps of the day only."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_fresh",
         "SASGeo trained without old maps",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
         _FRESH,
-        _GRAPH_FITTED,
-        _SILENT,
         limits=f"its rates of vanishing and appearing are those set by hand, which no map of the day can teach; "
         f"{_UNTAUGHT}",
     )
@@ -439,16 +447,11 @@ class SasgeoFresh(LearningMatcher):
 class SasgeoFreshAgeless(LearningMatcher):
     """The whole scorer, trained on maps of the day only, without the age of the map."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_fresh_ageless",
         "SASGeo trained without old maps, without the age of the map",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
         _FRESH,
         "every map is weighed as one of today is",
-        _GRAPH_FITTED,
-        _SILENT,
         limits=f"knows nothing of ageing; {_UNTAUGHT}",
     )
     switches = Switches(learns_from_old=False, knows_age=False)
@@ -457,16 +460,10 @@ class SasgeoFreshAgeless(LearningMatcher):
 class SasgeoStamped(LearningMatcher):
     """The whole scorer with edit ages of features."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_stamped",
         "SASGeo with OSM timestamps",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
         "features weigh by how long nobody had edited them when the map was taken, learnt by class in four strata",
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
     )
     switches = Switches(is_stamped=True)
 
@@ -474,14 +471,9 @@ class SasgeoStamped(LearningMatcher):
 class OracleSasgeo(LearningMatcher):
     """The whole scorer, trained on the places that it is asked: an upper bound for training."""
 
-    card = _card(
+    card = _whole(
         "oracle_sasgeo",
         "SASGeo that learns from the places it is asked on",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
-        _GRAPH_FITTED,
-        _SILENT,
         "a yardstick, never ranked: a pipeline names it among its oracles",
         limits=f"Knows what no matcher can know; {_LIMITS}",
     )
@@ -523,15 +515,9 @@ class SasgeoIndependent(LearningMatcher):
 class SasgeoHard(LearningMatcher):
     """The whole scorer that reads states alone."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_hard",
         "SASGeo, probabilities read as states",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
         reads="of a view with probabilities each cell is the likelier of present and absent: it tells what "
         "probabilities are worth",
     )
@@ -541,15 +527,9 @@ class SasgeoHard(LearningMatcher):
 class SasgeoGains(LearningMatcher):
     """The whole scorer without the terms that are ours."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_gains",
         "SASGeo by its gains alone",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
         terms=(_GAINS,),
     )
     switches = Switches(searches_overlap=False, weighs_prior=False, weighs_amounts=False, weighs_overlap="never")
@@ -558,15 +538,9 @@ class SasgeoGains(LearningMatcher):
 class SasgeoGainsSearch(LearningMatcher):
     """The whole scorer whose search knows no overlap."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_gains_search",
         "SASGeo that searches by its gains alone",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
         terms=("a view that is certain is searched for by its gains alone", _TERMS[1]),
     )
     switches = Switches(searches_overlap=False)
@@ -575,15 +549,9 @@ class SasgeoGainsSearch(LearningMatcher):
 class SasgeoNoPosePrior(LearningMatcher):
     """The whole scorer that takes all headings and scales for alike."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_no_pose_prior",
         "SASGeo without the prior of heading and scale",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
         terms=(_SEARCH, f"its modes are ranked, besides, by {_AMOUNTS}; by {_OVERLAP}"),
     )
     switches = Switches(weighs_prior=False)
@@ -592,15 +560,9 @@ class SasgeoNoPosePrior(LearningMatcher):
 class SasgeoNoAmounts(LearningMatcher):
     """The whole scorer that asks where a class lies, not how much of it there is."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_no_amounts",
         "SASGeo without the amounts of the classes",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
         terms=(_SEARCH, f"its modes are ranked, besides, by {_POSE_PRIOR}; by {_OVERLAP}"),
     )
     switches = Switches(weighs_amounts=False)
@@ -609,15 +571,9 @@ class SasgeoNoAmounts(LearningMatcher):
 class SasgeoNoOverlap(LearningMatcher):
     """The whole scorer that searches for overlap, and does not rank by it."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_no_overlap",
         "SASGeo that ranks without overlap",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
         terms=(_SEARCH, f"its modes are ranked, besides, by {_POSE_PRIOR}; by {_AMOUNTS}; not by the overlap"),
     )
     switches = Switches(weighs_overlap="never")
@@ -626,15 +582,9 @@ class SasgeoNoOverlap(LearningMatcher):
 class SasgeoOverlapAlways(LearningMatcher):
     """The whole scorer for which areas count as much as lines, however well these are seen."""
 
-    card = _card(
+    card = _whole(
         "sasgeo_overlap_always",
         "SASGeo, the overlap of areas always counts",
-        "Eqs. 5, 7-9, 11-14",
-        _FITTED,
-        _CORRELATED,
-        _GRAPH_FITTED,
-        _SILENT,
-        limits=_UNTAUGHT,
         terms=(
             _SEARCH,
             f"its modes are ranked, besides, by {_POSE_PRIOR}; by {_AMOUNTS}; by the overlap of all classes alike",

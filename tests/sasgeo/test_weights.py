@@ -9,7 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.rates import ClassRates
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
+from sasgeo_bench.sasgeo.variants import SasgeoSeasonless
 from sasgeo_bench.sasgeo.weights import information, likelihood_gains, weigh
 
 HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)
@@ -43,6 +46,15 @@ def test_a_class_out_of_season_counts_for_less():
     whole, half = (likelihood_gains([HOUSE], age_years=0.0, persists=[share]) for share in (1.0, 0.5))
     assert 0 < half.agree[0] < whole.agree[0]
     assert whole.missed[0] < half.missed[0] < 0
+
+
+def test_who_knows_no_season_weighs_a_view_of_winter_as_any_other():
+    model = ScorerModel.by_hand(("building", "green"))
+    told, untold = (Switches(knows_season=knows) for knows in (True, False))
+    snow, plain = (told.gains(model, age_years=1.0, season=season) for season in ("snow", ""))
+    assert snow.agree.tolist() != plain.agree.tolist()
+    assert untold.gains(model, age_years=1.0, season="snow").agree.tolist() == plain.agree.tolist()
+    assert SasgeoSeasonless.switches == untold
 
 
 @given(seed=st.integers(0, 9999))

@@ -36,7 +36,7 @@ DATED: Final = "real-age"  # a suite that has places with maps of several dates 
 Floats = NDArray[np.float64]
 
 
-def test_places(split: SplitFile, suites: list[str]) -> dict[str, str]:
+def ranked_places(split: SplitFile, suites: list[str]) -> dict[str, str]:
     """Return country by place, of the places that rank and have queries of some suites."""
     files = list_region_files()
     dated = {name for name, path in files.items() if len(read_region_file(path).extract) > 1}
@@ -90,7 +90,7 @@ def line(contrast: dict[str, Any], scores: pd.DataFrame, split: SplitFile, criti
     """Return the row of a contrast."""
     gaps = differences(scores, contrast)
     pilot = [own["gap"].to_numpy(float) for _, own in gaps.groupby("place", observed=True)]
-    country_of = list(test_places(split, contrast["suites"]).values())
+    country_of = list(ranked_places(split, contrast["suites"]).values())
     name, least = contrast["name"], float(contrast["min_effect"])
     if len(pilot) < 2:  # nothing is known of how places differ
         return f"| {name} | {len(gaps)}, {len(pilot)} | - | | | | | | | |"

@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -33,6 +34,8 @@ from sasgeo_bench.search.plan import (
 PATCH_KM2: Final = 17.0  # of places: a town, for which the beam was chosen
 _NOTHING: Final = 1e-9
 _CORNER: Final = math.sqrt(0.5)  # cells from the middle of one to its corner
+_HEADINGS: Final = 2  # guesses that a beam keeps of one place: on large cells the best heading is often a wrong one
+_SPARE: Final = 1.5  # times the beam, of guesses to choose from
 
 
 def search(
@@ -102,7 +105,7 @@ class Search:
 
     def places(self, count: int, starts: Sequence[Pose]) -> Found:
         """Return the best modes within the prior."""
-        guesses, null = self._begun(self.tiles, most=self.plan.width(0, self.patches))
+        guesses, null = self._begun(self.tiles, most=math.ceil(_SPARE * self.plan.width(0, self.patches)))
         guesses = _ranked([*(replace(guess, owner=0) for guess in guesses), *self._proposed(starts)])
         followed = self._followed(guesses, [self.disc], patches=self.patches)
         near = self.within(1)  # dropped modes were limited by larger cells
@@ -179,9 +182,8 @@ class Search:
     def _followed(self, guesses: list[Guess], discs: Sequence[Disc], *, patches: int = 1) -> list[Guess]:
         """Refine the best to the map's own cells and between them; best first, then dropped ones."""
         stride = Stride(yaw_deg=self.turns.yaw_step_deg, scale=self.turns.scale_step)
-        width = self.plan.width(0, patches)
-        kept, behind = guesses[:width], [guesses[width - 1 :]]
-        factor = self.factor
+        kept, rest = self._cut(guesses, self.plan.width(0, patches))
+        behind, factor = [rest], self.factor
         with in_threads(self.plan.threads) as mapped:
             while factor > 1:
                 factor, stride = factor // 2, stride.half()
@@ -189,8 +191,8 @@ class Search:
                 near = [disc.wider(_CORNER * factor * self.field.grid.cell_size_m) for disc in discs]
                 moved = _ranked(mapped(step, kept, [near[guess.owner] for guess in kept]))
                 merged = _merged(moved, factor * self.field.grid.cell_size_m, stride.yaw_deg)
-                width = self.plan.width(len(behind), patches)
-                kept, behind = merged[:width], [*behind, merged[width - 1 :]]
+                kept, rest = self._cut(merged, self.plan.width(len(behind), patches))
+                behind.append(rest)
             near = [disc.wider(_CORNER * self.field.grid.cell_size_m) for disc in discs]
             level_view = LevelView.of(self.field, self.template, 1)
             for move in (climbed, climbed, polished):
@@ -199,6 +201,32 @@ class Search:
         for rest in reversed(behind):
             kept = [*kept, *_below(kept, rest)]
         return kept
+
+    def _cut(self, guesses: Sequence[Guess], width: int) -> tuple[list[Guess], list[Guess]]:
+        """Return the best guesses, few of each place, so that copies of one do not fill the beam; and all others.
+
+        The latter begin with the last that is kept, and none counts for more than it.
+        """
+        kept: list[Guess] = []
+        rest: list[Guess] = []
+        near: dict[tuple[int, int, int], list[Guess]] = {}
+        side_m = max(self.plan.apart_m, _NOTHING)
+        for guess in guesses:
+            place = place_m(guess.mode.pose)
+            row, col = (math.floor(at_m / side_m) for at_m in place)
+            around = product((row - 1, row, row + 1), (col - 1, col, col + 1), (guess.owner,))
+            others = (other for key in around for other in near.get(key, ()))
+            alike = sum(math.dist(place, place_m(other.mode.pose)) < self.plan.apart_m for other in others)
+            if len(kept) < width and alike < _HEADINGS:
+                kept.append(guess)
+                near.setdefault((row, col, guess.owner), []).append(guess)
+            else:
+                rest.append(guess)
+        if not rest:
+            return kept, []
+        last = kept[-1].mode.score
+        lower = (replace(guess.mode, score=min(last, guess.mode.score)) for guess in rest)
+        return kept, [kept[-1], *(replace(guess, mode=mode) for guess, mode in zip(rest, lower, strict=True))]
 
 
 def _ranked(guesses: Iterable[Guess]) -> list[Guess]:

@@ -14,7 +14,7 @@ from sasgeo_bench.core.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, cell_offsets_m, observe
-from sasgeo_bench.search.dense import LevelView, _Peaks
+from sasgeo_bench.search.dense import Guess, LevelView, _Peaks
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
 from sasgeo_bench.search.find import Search, exhaustive, rank, score_at, search
 from sasgeo_bench.search.plan import Mode, Plan, all_around, posterior, thinned
@@ -232,6 +232,27 @@ def test_candidates_behind_the_beam_keep_their_order_below_the_others(place):
     assert all(narrow)
     assert narrow[0].pose == wide[0].pose
     assert len({mode.score for mode in narrow}) > 2
+
+
+def test_copies_of_a_place_do_not_fill_the_beam(place):
+    def guesses(owner, easts_m, best):
+        poses = [Pose(easting_m=east_m, northing_m=0.0, yaw_deg=float(at)) for at, east_m in enumerate(easts_m)]
+        return [Guess(mode=Mode(pose=pose, score=best - at), owner=owner) for at, pose in enumerate(poses)]
+
+    template = as_template(view_of(place, some_poses(place[0], 1)[0]))
+    found = Search(field=place[2], template=template, prior=ANYWHERE, plan=Plan(apart_m=25.0))
+    crowded = guesses(0, [0.0, 4.0, 8.0, 20.0, 24.9, 26.0, 60.0, 61.0], best=9.0)
+    kept, rest = found._cut(crowded, 4)
+    assert [guess.mode.pose.easting_m for guess in kept] == [0.0, 4.0, 26.0, 60.0]
+    assert rest[0] == kept[-1]
+    assert [guess.mode.pose.easting_m for guess in rest[1:]] == [8.0, 20.0, 24.9, 61.0]
+    assert max(guess.mode.score for guess in rest) == kept[-1].mode.score
+    assert found._cut(crowded, 1)[0] == crowded[:1]
+    assert found._cut([], 4) == ([], [])
+    of_others = [guess for at in range(4) for guess in guesses(at, [0.0], best=9.0 - at)]
+    assert found._cut(of_others, 4) == (of_others, [])  # each candidate has places of its own
+    every = replace(found, plan=Plan(apart_m=0.0))
+    assert every._cut(crowded, 5)[0] == crowded[:5]
 
 
 def test_twice_the_ground_has_twice_the_beam_of_a_town():

@@ -288,6 +288,7 @@ class PipelineFile(NamedDocument):
     title: Line
     split: str | None = None
     regions: list[str] = []
+    regions_of_a_place: Annotated[int, Field(ge=1)] | None = None
     seed: int = 0
     task: list[TaskSpec] = []
     paper: PaperSpec | None = None
@@ -306,7 +307,9 @@ class PipelineFile(NamedDocument):
     def sha256(self) -> str:
         """Hash of all that it says of the experiment, defaults among it, as `board.json` names it."""
         left_out = {"archive"} | {
-            name for name in ("learning", "reference_imagery", "metrics") if not getattr(self, name)
+            name
+            for name in ("learning", "reference_imagery", "metrics", "regions_of_a_place")
+            if not getattr(self, name)
         }
         fields = self.model_dump(mode="json", exclude=left_out)
         pilots = [item["pilot"] for item in fields["contrast"] if item["pilot"] is not None]
@@ -335,6 +338,8 @@ class PipelineFile(NamedDocument):
             raise ValueError("'split' is missing: [[task]] is drawn on the regions of a split")
         if not self.task and (self.split is not None or self.regions):
             raise ValueError("'split' and 'regions' are for [[task]], and there is none: leave them out")
+        if self.regions_of_a_place and (self.regions or not self.task):
+            raise ValueError("'regions_of_a_place' bounds what is drawn of a split: leave it out, or 'regions'")
         return self
 
     @model_validator(mode="after")

@@ -438,6 +438,7 @@ def plan_pipeline(
         asked = TaskRequest(
             suites=tuple(task.suites),
             regions=tuple(task.regions or spec.regions),
+            each=spec.regions_of_a_place,
             split=str(spec.split),  # a file with tasks names one
             count=task.sites,
             seed=seed,

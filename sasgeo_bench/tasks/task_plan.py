@@ -2,6 +2,7 @@
 """Planning: a user's wishes become one request for each region and suite; errors are found before anything is read."""
 
 import datetime as dt
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -94,11 +95,13 @@ class TaskRequest(Settings):
     """Suites, a split, and regions as ids or files; without regions, all of the split that can be built.
 
     Without a split it is `SPLIT`, or, of a single place that this does not speak of, one in which all of it is test.
-    `sealed_seed` draws the sealed places of the split; without it they are left out.
+    `sealed_seed` draws the sealed places of the split; without it they are left out. Without regions, `each` bounds
+    those of a place: the first of the split that can be built.
     """
 
     suites: tuple[str, ...]
     regions: tuple[str, ...]
+    each: int | None = None
     split: str | None = None
     region_folders: tuple[Path, ...] = ()
     sealed_seed: PrivateSeed | None = None
@@ -136,6 +139,7 @@ def plan_requests(wanted: TaskRequest) -> tuple[Request, ...]:
         left = [item.id for item in listed if item not in named]
         if left:
             tell(f"{len(left)} regions have no extract on this machine and are left out: {', '.join(left)}")
+        named = _few_of_each(named, split, wanted.each)
     stranger = next((item.id for item in named if item.id not in split.spec.region_ids), None)
     if stranger is not None:
         raise ConfigError(f"split {split.spec.id!r} does not speak of region {stranger!r}: {_other_split(stranger)}")
@@ -152,6 +156,20 @@ def plan_requests(wanted: TaskRequest) -> tuple[Request, ...]:
         for item in _without_sealed({item.id: item for item in named}, split, wanted)
         for spec, suite in suites.items()
     )
+
+
+def _few_of_each(regions: list[RegionFile], split: Split, most: int | None) -> list[RegionFile]:
+    """Return the first regions of each place, at most so many; one of several places counts for the first of them."""
+    if most is None:
+        return regions
+    places = Counter[str]()
+    kept = []
+    for item in regions:
+        place = next(iter(split.places_in(item.id)), item.id)
+        places[place] += 1
+        if places[place] <= most:
+            kept.append(item)
+    return kept
 
 
 def _split(wanted: TaskRequest, named: Sequence[RegionFile], known: Mapping[str, RegionFile]) -> Split:

@@ -555,6 +555,32 @@ def test_of_several_models_each_is_asked_in_countries_of_its_own():
     assert set(one.of(tasks, tasks, is_oracle=False)[0].asked) == set(asked)
 
 
+def test_of_a_place_the_first_regions_are_drawn_and_never_two_lists_of_them(tmp_path):
+    places = "".join(
+        f'[[place]]\nname = "{name}"\nhalf = "{half}"\nregions = {regions}\n'
+        for name, half, regions in (
+            ("one", "a", '["town-suburb", "town-grid"]'),
+            ("two", "b", '["town-agricultural"]'),
+            ("three", "a", '["town-riverside"]'),
+            ("four", "b", '["town-industrial"]'),
+        )
+    )
+    split = tmp_path / "few.toml"
+    head = 'id = "few"\ntitle = "Few"\nkind = "crossfit"\nbuffer_m = 0.0\nblock_m = 500.0\nreach_m = 100.0\n'
+    split.write_text(head + places, encoding="utf-8")
+    text = TEXT.replace('split = "crossfit"', f'split = "{split}"')
+    text = "\n".join(line for line in text.splitlines() if not line.startswith("regions"))
+    found = {}
+    for line in ("", "regions_of_a_place = 1", "regions_of_a_place = 2"):
+        plan = plan_pipeline(parse_toml(f"{line}\n{text}", PipelineFile, source="few.toml"), out=tmp_path / "out")
+        found[line] = [request.region.id for request in plan.requests]
+    assert "town-grid" in found[""]
+    assert found["regions_of_a_place = 1"] == [name for name in found[""] if name != "town-grid"]
+    assert found["regions_of_a_place = 2"] == found[""]
+    with pytest.raises(ConfigError, match="'regions_of_a_place' bounds what is drawn of a split"):
+        parse_toml(f"regions_of_a_place = 1\n{TEXT}", PipelineFile, source="few.toml")
+
+
 def test_of_several_models_in_a_cross_fit_each_half_has_its_own():
     split = find_split("crossfit")
     tasks = [Path("out/tasks/clean") / name for name in split.spec.region_ids]

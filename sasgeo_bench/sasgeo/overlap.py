@@ -19,7 +19,7 @@ UNLIKE_M2: Final = 400.0  # of a class, of which a view and a map may differ by 
 SEARCHED: Final = 30.0  # nats of a class whose overlap is whole, in a search; as the next two, from train places
 RARE_M2: Final = 1000.0  # of a class in a view that count half
 CROWDED: Final = 0.03  # charge for a mapped cell, as a share of what one brings that is seen
-BADLY_SEEN, BLUNT = 0.25, 0.05  # overlap of lines at which areas have half of their say, and how fast that falls
+BADLY_SEEN, BLUNT = 0.2, 0.03  # overlap of lines at which areas have half of their say, and how fast that falls
 _MOST_ALIKE: Final = 0.99  # squared correlation
 _MOST_FADED: Final = 0.9  # a class that fades less is taken as it is
 _LEAST: Final = 1e-6
@@ -111,10 +111,14 @@ class Compared:
         )
 
     @property
+    def either(self) -> Floats:
+        """Return the area that view or map hold of each class, square metres."""
+        return self.seen + self.mapped - self.both
+
+    @property
     def overlaps(self) -> Floats:
         """Return the intersection over union of each class, 0..1; 0 where neither side holds it."""
-        either = self.seen + self.mapped - self.both
-        return np.where(either > LEAST_M2, self.both / np.maximum(either, LEAST_M2), 0.0)
+        return np.where(self.either > LEAST_M2, self.both / np.maximum(self.either, LEAST_M2), 0.0)
 
     @property
     def unlike(self) -> Floats:
@@ -177,8 +181,9 @@ def overlap_of(compared: Compared, is_line: NDArray[np.bool_], *, is_gated: bool
     """Return the overlap of each pose of a list, shape (M,): that of its lines, and of areas as far as lines are faint.
 
     Lines last, areas are filled and cleared: where a view shows lines well, at the best of all poses, it is they that
-    tell places apart. A detector that errs much loses lines first; then areas have all the say they can get. Unless it
-    `is_gated`, all classes have it always. `is_line` has shape (C,).
+    tell places apart. A detector that errs much loses lines first; then areas have all the say they can get. How well
+    lines are seen is told by all their ground as one. Unless it `is_gated`, all classes have their say always. `is_line`
+    has shape (C,).
 
     Examples
     --------
@@ -186,11 +191,13 @@ def overlap_of(compared: Compared, is_line: NDArray[np.bool_], *, is_gated: bool
     >>> some = [[[100.0, 0.0], [0.0, 100.0]], [[5.0, 0.0], [0.0, 100.0]]]  # lines: seen well, hardly seen
     >>> whole = {name: np.repeat(flat, 2, axis=0) for name in ("known", "seen", "mapped", "seen_twice", "mapped_twice")}
     >>> [overlap_of(Compared(both=np.array(both), **whole), np.array([True, False])).round(2).tolist() for both in some]
-    [[1.0, 0.0], [0.03, 0.99]]
+    [[1.0, 0.0], [0.03, 1.0]]
     """
     overlaps = compared.overlaps
     of_lines, of_areas = overlaps[:, is_line].sum(axis=1), overlaps[:, ~is_line].sum(axis=1)
     if not is_gated or not len(of_lines):
         return np.asarray(of_lines + of_areas)
-    say = 1 / (1 + np.exp((of_lines.max() - BADLY_SEEN) / BLUNT))
+    both, either = (areas[:, is_line].sum(axis=1) for areas in (compared.both, compared.either))
+    seen = float((both / np.maximum(either, LEAST_M2)).max())
+    say = 1 / (1 + np.exp((seen - BADLY_SEEN) / BLUNT))
     return np.asarray(of_lines + say * of_areas)

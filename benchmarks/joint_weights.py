@@ -121,12 +121,12 @@ def settings() -> Iterator[tuple[str, Callable[[Modes], bool]]]:
         *((True, at, 0.03) for at in (0.1, 0.15, 0.2, 0.25, 0.3)),
     ):
         name = f"lines {'as one' if as_one else 'by class'}, {middle:g} / {width:g}"
-        yield name, lambda view, g=(middle, width, as_one): view.finds(say=gated(view, g[0], g[1], as_one=g[2]))  # type: ignore[misc]
+        yield name, lambda view, g=(middle, width, as_one): view.finds(say=gated(view, g[0], g[1], as_one=g[2]))
     for key in ("amount", "overlap"):
         for factor in FACTORS:
             yield (
                 f"{factor:g} times the {key}",
-                lambda view, f={key: factor}: view.finds(say=gated(view, BADLY_SEEN, BLUNT, as_one=True), **f),  # type: ignore[misc]
+                lambda view, f={key: factor}: view.finds(say=gated(view, BADLY_SEEN, BLUNT, as_one=True), **f),
             )
 
 

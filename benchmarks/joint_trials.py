@@ -3,11 +3,12 @@
 
     .venv/bin/python benchmarks/joint_trials.py --out out/joint-trials
     .venv/bin/python benchmarks/joint_trials.py --out out/joint-trials --arm sasgeo --arm sasgeo_gains
+    .venv/bin/python benchmarks/joint_trials.py --out out/joint-trials-again --seed 4321 --arm sasgeo --arm sasgeo_gains
     .venv/bin/python benchmarks/joint_trials.py --table docs/results/joint-trials.csv
 
 The first command draws views of 192 m of a train place of each train country (split `trials`) of the suites in `DRAWN`,
 learns from the places of the other half, asks each arm, and writes each answer; it resumes. `listed` is whether the
-truth is among the modes that the arm ranked. The third prints the table of stored answers: the share that is found
+truth is among the modes that the arm ranked. The last prints the table of stored answers: the share that is found
 within 25 m and 5 degrees, and flips to right and to wrong against `sasgeo_gains`, which ranks by Eq. 11 alone.
 Intervals are 95 %, by resampling places.
 """
@@ -98,7 +99,7 @@ class _Lesson:
         return self.query.query_id
 
 
-def draw(out: Path) -> None:
+def draw(out: Path, seed: int) -> None:
     """Draw the views of all suites; a region of which there are some is left alone."""
     for suite, sites in DRAWN.items():
         there = {base_of(folder.name) for folder in (out / "tasks" / suite).glob("*")}
@@ -106,7 +107,7 @@ def draw(out: Path) -> None:
         prior = {"prior": PRIOR} if suite in ("clean", "volatile-lure", "absent") else {}
         if wanted:
             sgb.make_tasks(
-                suite=[suite], regions=wanted, split=SPLIT, n=sites, seed=SEED, out=out, up_to=True, skip=True, **prior
+                suite=[suite], regions=wanted, split=SPLIT, n=sites, seed=seed, out=out, up_to=True, skip=True, **prior
             )
 
 
@@ -240,11 +241,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/joint-trials"), help="folder of maps, views and answers")
     parser.add_argument("--arm", action="append", default=[], help="matcher to ask; may be repeated; default: all")
+    parser.add_argument(
+        "--seed", type=int, default=SEED, help="of the views: another one takes other sites of the places"
+    )
     parser.add_argument("--table", type=Path, help="print the table of stored answers, and stop")
     options = parser.parse_args()
     try:
         if options.table is None:
-            draw(options.out)
+            draw(options.out, options.seed)
             path = options.out / "answers.csv"
             for arm in options.arm or ARMS:
                 done = {(one.arm, one.query_id) for one in read_answers(path)}

@@ -10,13 +10,20 @@ views; they say nothing of other places. A place whose picture taught the segmen
 `--every N` every Nth view. `--adapt` adapts the network without labels: `exposure` takes that of the whole picture
 instead of each view's, `mirrored` the mean with the mirrored view, `both` both, `scales` the mean of the view as it is,
 smaller and larger; of the weights of `--segmenter`.
+
+`--profile FILE` writes the perception profile over all regions instead, of classes as the segmenter tells them; with
+`--silence SHARE` it says what is withheld when that share of all answers, the least sure ones, is. The profile of the
+detector "silent" was made by
+
+    .venv/bin/python benchmarks/real_pictures.py --out out chateaugiron-ortho andorra-la-vella-ortho \
+        --profile sasgeo_bench/tasks/perturbations/silent.toml --silence 0.05
 """
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Final
 
@@ -27,8 +34,10 @@ import sasgeo_bench as sgb
 from sasgeo_bench.core.config import JsonDocument
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.core.texts import one_line
+from sasgeo_bench.scoring.perception_profile import measure_profile
 from sasgeo_bench.scoring.segmentation import PixelCounts, segmentation_scores
 from sasgeo_bench.sensing.reference_imagery import region_views
+from sasgeo_bench.tasks.perturbations.perception_profile import write_profile
 
 ROADS: Final = ("road_major", "road_minor")
 ROAD: Final = "road"
@@ -152,6 +161,17 @@ def areas_of(counts: Sequence[PixelCounts]) -> dict[str, Area]:
     return found
 
 
+def write_profile_of(segmenter: sgb.Segmenter, views: Iterable[sgb.LabelledImage], silence: float, path: Path) -> None:
+    """Write the perception profile of a segmenter on some views."""
+    counts = [
+        PixelCounts.of(view, segmenter.segment(view.image, learned=None), image=str(number))
+        for number, view in enumerate(views)
+    ]
+    card = segmenter.card
+    taught = ", ".join(card.trained_on) or "nothing"
+    write_profile(measure_profile(counts, segmenter=card.name, learned_from=taught, silence=silence), path)
+
+
 def weights_of(segmenter: str) -> Path:
     """Return the weights of a segmenter that can be adapted; end with one line for any other."""
     known = {"osm_unet": WEIGHTS, "osm_unet_held_out": HELD_OUT_WEIGHTS}
@@ -169,11 +189,18 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, help="of osm_unet, instead of those that ship")
     parser.add_argument("--box", type=box_of, default=WHOLE, help="west, east, north, south, fractions from 0 to 1")
     parser.add_argument("--every", type=positive, default=1, help="take one view of so many")
+    parser.add_argument("--profile", type=Path, help="write the perception profile into this file, and no table")
+    parser.add_argument("--silence", type=float, default=0.0, help="share of the answers that --profile withholds")
     parser.add_argument("--adapt", choices=("exposure", "mirrored", "both", "scales"), help="of osm_unet")
     options = parser.parse_args()
     box = options.box
     regions = {name: sgb.read_region(options.out / "regions" / name) for name in options.regions}
     weights = options.weights or (weights_of(options.segmenter) if options.adapt else None)
+    if options.profile:
+        views = chain.from_iterable(views_of(region, box, options.every) for region in regions.values())
+        segmenter = sgb.load_segmenter(options.segmenter)
+        write_profile_of(segmenter, views, options.silence, options.profile)
+        return
     print("| region | class | AUC | 95 % | share | views |\n|---|---|---:|---|---:|---:|")
     for name, region in regions.items():
         if weights is None:

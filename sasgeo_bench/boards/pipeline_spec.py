@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from sasgeo_bench.boards.manifests import PipelineRecord
 from sasgeo_bench.core.config import (
@@ -37,7 +37,7 @@ from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.sensing.reference_imagery import COARSEST_M, FINEST_M, Look
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.seasons import Season
-from sasgeo_bench.tasks.query import BY, CONTROLS, PROFILE, PUBLISHED, RENDERED, Detector, PriorGroup, Track
+from sasgeo_bench.tasks.query import BY, CONTROLS, PUBLISHED, RENDERED, Detector, PriorGroup, Track
 from sasgeo_bench.tasks.suites.ages import DAYS_PER_YEAR
 
 PAPER_SUITE: Final = "paper-poc"
@@ -163,15 +163,6 @@ class TaskSpec(Document):
     detectors: Annotated[list[Detector], Field(min_length=1)] = ONE_DETECTOR
     segmenters: list[SegmenterName] = []
     regions: list[str] = []
-
-    @field_validator("detectors")
-    @classmethod
-    def _need_no_file(cls, detectors: list[Detector]) -> list[Detector]:
-        if PROFILE in detectors:
-            raise ValueError(
-                "'profile' needs the file of a perception profile, which make-queries --profile alone takes"
-            )
-        return detectors
 
     @property
     def asked(self) -> list[str]:

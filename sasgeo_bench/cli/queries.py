@@ -53,7 +53,8 @@ class QueryOptions(Options):
     detector: Annotated[
         list[str] | None,
         typer.Option(
-            help="family of errors: published or measured, of pictures rendered or shifted; may be repeated, for pairs"
+            help="family of errors: published, measured or silent, of pictures rendered or shifted; may be repeated, "
+            "for pairs"
         ),
     ] = None
     profile: Annotated[
@@ -160,9 +161,10 @@ def _choice(options: QueryOptions) -> Choice:
     if options.profile is None:
         return Choice(detectors=_detectors(options.detector))
     profile = read_profile(options.profile)
-    perfect = [name for name in load_taxonomy().names if name not in profile.classes]
-    if perfect:
-        tell(f"{options.profile} has no rates of {', '.join(perfect)}: views show that without errors")
+    lost = [name for name in load_taxonomy().names if name not in profile.classes]
+    if lost:
+        instead = "is unknown in all views" if profile.silence else "views show that without errors"
+        tell(f"{options.profile} has no rates of {', '.join(lost)}: {instead}")
     return Choice(detectors=_detectors([*(options.detector or ()), PROFILE]), profile=profile)
 
 

@@ -90,7 +90,7 @@ TRUTH_TEXTS: Final = {
     "block": "evaluation block, region/row-column; resample by it, never by single queries",
     "scene": "tags of the region",
     "measured": "what was measured to have been done, name and value",
-    "detector": "family of the errors of perception: published, measured, or profile",
+    "detector": "family of the errors of perception: published, measured, silent, or profile",
 }
 FEATURE_TEXTS: Final = {
     "osm_type": "node, way or relation; coastline for sea, which is no object but lies right of the coastlines",

@@ -171,8 +171,8 @@ KEPT: Final = 0.8  # coverage at which the error of the surest pixels is reporte
 GROUPS: Final = ("all", "place", "season")
 _CHANCES: Final = np.arange(SILENT) / CERTAIN
 _BIN: Final = np.minimum((_CHANCES * BINS).astype(int), BINS - 1)
-_LEVELS: Final = np.abs(np.arange(SILENT) - SEEN)  # how sure a byte is, 0 to 127
-_IN_LEVEL: Final = (_LEVELS[:, None] == np.arange(SEEN, -1, -1)).astype(np.float64)  # surest first
+LEVELS: Final = np.abs(np.arange(SILENT) - SEEN)  # how sure a byte is, 0 to 127
+_IN_LEVEL: Final = (LEVELS[:, None] == np.arange(SEEN, -1, -1)).astype(np.float64)  # surest first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

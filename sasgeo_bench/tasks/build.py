@@ -29,9 +29,10 @@ from sasgeo_bench.tasks.edited_maps import changed_maps, degraded_map, edit_maps
 from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer, LoggedFlight
 from sasgeo_bench.tasks.frame_files import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
+from sasgeo_bench.tasks.perturbations.perception import silent_profile
 from sasgeo_bench.tasks.pictured_ground import PicturedGround
 from sasgeo_bench.tasks.private_seed import seed_record
-from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
+from sasgeo_bench.tasks.query import SILENT, TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
 from sasgeo_bench.tasks.split import Block, Split
 from sasgeo_bench.tasks.state import State
@@ -146,6 +147,8 @@ def _request_sha256(request: Request) -> str:
             del choice["detectors"]
         if request.choice.profile is not None:
             choice["profile"] = request.choice.profile.model_dump(mode="json")
+        if SILENT in request.choice.detectors:
+            choice["silent"] = silent_profile().model_dump(mode="json")
         content["choice"] = choice
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

@@ -35,13 +35,14 @@ TASK_VERSIONS: Final = (1, 2, 3, 4, TASK_VERSION)  # readable versions: their fi
 Track = Literal["retrieval", "localization", "sequence"]
 Yaw = Literal["known", "weak", "unknown"]
 Role = Literal["control", "stress", "falsifier"]
-# Families of errors of perception: three models of a detector, and looks of pictures, which a segmenter sees.
-Detector = Literal["published", "measured", "profile", "rendered", "shifted", "real"]
+# Families of errors of perception: four models of a detector, and looks of pictures, which a segmenter sees.
+Detector = Literal["published", "measured", "silent", "profile", "rendered", "shifted", "real"]
 PUBLISHED: Final[Detector] = "published"  # the one that is meant where none is named
 RENDERED: Final[Detector] = "rendered"  # pictures of the ordinary look; from these segmenters learn
 REAL: Final[Detector] = "real"
 PROFILE: Final[Detector] = "profile"  # the measured confusions of a segmenter, from a file
-PERCEIVED: Final[tuple[Detector, ...]] = (PUBLISHED, "measured", PROFILE)  # models, the first if none is chosen
+SILENT: Final[Detector] = "silent"  # those of one segmenter that withholds what it is unsure of; they ship
+PERCEIVED: Final[tuple[Detector, ...]] = (PUBLISHED, "measured", SILENT, PROFILE)  # the first if none is chosen
 PAINTED: Final[tuple[Detector, ...]] = (RENDERED, "shifted")  # looks of rendered pictures, the first if none is chosen
 BY: Final = "+"  # between a suite of pictures and the segmenter that made its evidence
 _MOST_M: Final = 1e6  # of a view's vectors from its middle: no view is as large
@@ -338,7 +339,7 @@ class Truth:
         Evaluation block of the centre, the unit of resampling, and scene tags of the region.
     measured : mapping of str to float
         Manipulation check: measures of the applied change.
-    detector : {"published", "measured", "profile", "rendered", "shifted", "real"}
+    detector : {"published", "measured", "silent", "profile", "rendered", "shifted", "real"}
         Family of the errors of perception, or of the look of pictures; the query does not tell it.
     labels : tuple of FrameLabels
         What is on the pixels of each frame; only in memory, and in a file beside the truths.

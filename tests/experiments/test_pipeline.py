@@ -344,7 +344,6 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ),
         ({"sites = 1": 'sites = 1\ntracks = ["retrieval"]'}, "is of localization, and no .* draws that track"),
         ({"sites = 1": 'sites = 1\ndetectors = ["mine"]'}, "must be 'published', 'measured'"),
-        ({"sites = 1": 'sites = 1\ndetectors = ["profile"]'}, "'profile' needs the file of a perception profile"),
         ({"sites = 1": 'sites = 1\ndetectors = ["measured", "measured"]'}, "detector 'measured' is listed twice"),
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),
@@ -626,6 +625,22 @@ def test_the_detectors_of_a_task_reach_its_queries(tmp_path):
     text = LEARNING.replace("[[task]]", '[[task]]\ndetectors = ["published", "measured"]')
     plan = plan_pipeline(taught_by("", text), out=tmp_path)
     assert {request.choice.detectors for request in plan.requests} == {("published", "measured")}
+
+
+def test_a_detector_whose_errors_are_in_a_file_is_refused_before_anything_is_made(tmp_path):
+    spec = small(**{"sites = 1": 'sites = 1\ndetectors = ["profile"]'})
+    with pytest.raises(ConfigError, match=r"\[\[task\]\] 1 of 1: detector 'profile' needs a perception profile"):
+        plan_pipeline(spec, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_tasks_of_the_detector_silent_are_drawn_again_when_its_profile_changes(tmp_path, monkeypatch):
+    spec = small(**{"sites = 1": 'sites = 1\ndetectors = ["published", "silent"]'})
+    (request,) = (one for one in plan_pipeline(spec, out=tmp_path).requests if one.suite == "clean")
+    before = tasks._request_sha256(request)
+    other = tasks.silent_profile().model_copy(update={"images": 1})
+    monkeypatch.setattr(tasks, "silent_profile", lambda: other)
+    assert tasks._request_sha256(request) != before
 
 
 def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp_path):

@@ -1,19 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Confusions of a segmenter: measured, written, read, and met again in the views that are drawn with them."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from sasgeo_bench.core.errors import ConfigError, MetricError
-from sasgeo_bench.regions.evidence import PRESENT, Evidence
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.scoring.perception_profile import measure_profile
 from sasgeo_bench.scoring.segmentation import PixelCounts
 from sasgeo_bench.sensing.image import LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.sensing.tiny_images import with_picture
-from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredPerception
+from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredPerception, Silence
+from sasgeo_bench.tasks.perturbations.perception import perception_of, silent_profile
 from sasgeo_bench.tasks.perturbations.perception_profile import read_profile, write_profile
 
 CLASSES = ("building", "road_minor", "green")
@@ -86,7 +88,7 @@ def test_a_profile_comes_back_from_its_file_up_to_its_digits(profile, tmp_path):
 
 def test_views_drawn_with_a_profile_have_its_rates(profile):
     view = Evidence(classes=CLASSES, cells=town(), cell_size_m=1.0)
-    perception = MeasuredPerception(errors=profile.errors())
+    perception = profile.perception()
     after = [perception(view, np.random.default_rng(seed)).cells == PRESENT for seed in range(40)]
     building, road, green = town().astype(bool)
     ground = ~(building | road | green)
@@ -99,6 +101,157 @@ def test_views_drawn_with_a_profile_have_its_rates(profile):
     assert share("building", ground) == pytest.approx(0.06, abs=0.02)
     assert share("green", road) == pytest.approx(0.2, abs=0.08)
     assert share("road_minor", road) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.fixture(scope="module")
+def answers():
+    """Labels of two classes, some unknown, and what a segmenter says of them: more on what is there, some nothing."""
+    rng = np.random.default_rng(2)
+    labels = rng.choice([0, 1, UNKNOWN], p=[0.6, 0.3, 0.1], size=(2, 40, 50)).astype(np.uint8)
+    bytes_ = np.clip(rng.normal(90 + 60 * (labels == PRESENT), 40), 0, 254).astype(np.uint8)
+    bytes_[1, :3] = 255
+    return labels, bytes_
+
+
+def measured_silence(answers, silence):
+    labels, bytes_ = answers
+    picture = with_picture(np.zeros((*labels.shape[1:], 3), dtype=np.uint8))
+    labelled = LabelledImage(image=picture, classes=CLASSES[:2], labels=labels, place="here")
+    counts = PixelCounts.of(labelled, Segmentation(classes=CLASSES[:2], probability_bytes=bytes_), image="1")
+    return measure_profile([counts], segmenter="mine", learned_from="elsewhere", silence=silence)
+
+
+@pytest.mark.parametrize("silence", [0.001, 0.05, 0.2, 0.5, 0.99])
+def test_what_is_withheld_is_what_one_limit_on_all_answers_leaves_out(answers, silence):
+    labels, bytes_ = answers
+    answered = (labels != UNKNOWN) & (bytes_ != 255)
+    sure = np.abs(bytes_.astype(int) - 127)
+    limit = next(at for at in range(128) if (sure[answered] <= at).mean() >= silence)
+    withheld, seen = sure <= limit, bytes_ >= 127
+    found = measured_silence(answers, silence)
+    assert found.silence == silence
+    for at, name in enumerate(CLASSES[:2]):
+        for key, is_there, is_seen in (("found", 1, 1), ("missed", 1, 0), ("alarm", 0, 1), ("absent", 0, 0)):
+            where = answered[at] & ((labels[at] == PRESENT) == is_there) & (seen[at] == is_seen)
+            assert getattr(found.classes[name].silent, key) == pytest.approx(withheld[at][where].mean()), (name, key)
+
+
+def test_rates_are_of_all_answers_with_silence_and_without_it(answers):
+    silent, plain = measured_silence(answers, 0.3), measured_silence(answers, 0.0)
+    assert "silent" not in str(plain.model_dump())
+    for name, found in plain.classes.items():
+        assert silent.classes[name].model_dump(exclude={"silent"}) == found.model_dump()
+
+
+def test_answers_that_never_came_are_never_given():
+    half = np.full((3, SIDE, SIDE), 130, dtype=np.uint8)
+    picture = with_picture(np.zeros((SIDE, SIDE, 3), dtype=np.uint8))
+    labelled = LabelledImage(image=picture, classes=CLASSES, labels=town(), place="here")
+    half[0] = 200
+    counts = PixelCounts.of(labelled, Segmentation(classes=CLASSES, probability_bytes=half), image="1")
+    profile = measure_profile([counts], segmenter="mine", learned_from="elsewhere", silence=0.1)
+    assert profile.classes["building"].silent == Silence(found=0.0, missed=1.0, alarm=0.0, absent=1.0)
+    assert profile.classes["green"].silent == Silence(found=1.0, missed=1.0, alarm=1.0, absent=1.0)
+
+
+@pytest.mark.parametrize("silence", [-0.1, 1.0, float("nan")])
+def test_a_share_to_withhold_that_is_none_is_refused(answers, silence):
+    with pytest.raises(MetricError, match="silence is a share of the answers, at least 0 and below 1, got"):
+        measured_silence(answers, silence)
+
+
+@pytest.fixture(scope="module")
+def quiet(profile):
+    """The same profile, silent on buildings and roads."""
+    shares = {
+        "building": Silence(found=0.4, missed=0.5, alarm=0.8, absent=0.03),
+        "road_minor": Silence(found=0.1, missed=0.0, alarm=0.6, absent=0.0),
+    }
+    classes = {name: profile.classes[name].model_copy(update={"silent": each}) for name, each in shares.items()}
+    return profile.model_copy(update={"silence": 0.05, "classes": classes})
+
+
+def test_views_are_silent_in_the_shares_of_the_profile_and_have_the_errors_they_have_without(quiet):
+    view = Evidence(classes=CLASSES, cells=town(), cell_size_m=1.0)
+    spoken = dataclasses.replace(quiet.perception(), silence={})
+    pairs = [
+        (spoken(view, np.random.default_rng(seed)).cells, quiet.perception()(view, np.random.default_rng(seed)).cells)
+        for seed in range(20)
+    ]
+    for before, after in pairs:
+        np.testing.assert_array_equal(after[after != UNKNOWN], before[after != UNKNOWN])
+    was, now = (np.stack(some, axis=1) for some in zip(*pairs, strict=True))
+    for at, name in enumerate(CLASSES[:2]):
+        there, seen, silent = town()[at] == PRESENT, was[at] == PRESENT, now[at] == UNKNOWN
+        for key, where in (
+            ("found", there & seen),
+            ("missed", there & ~seen),
+            ("alarm", ~there & seen),
+            ("absent", ~there & ~seen),
+        ):
+            if where.any():
+                assert silent[where].mean() == pytest.approx(getattr(quiet.classes[name].silent, key), abs=0.01)
+    assert (now[2] == UNKNOWN).all()  # it has no rates of green
+
+
+def test_silence_lies_along_the_outlines_of_what_is_seen(quiet):
+    cells = np.zeros((1, 120, 120), dtype=np.uint8)
+    cells[0, 20:100, 20:100] = 1
+    view = Evidence(classes=("building",), cells=cells, cell_size_m=1.0)
+    inner = np.zeros((120, 120), dtype=bool)
+    inner[40:80, 40:80] = True
+    silent = [quiet.perception()(view, np.random.default_rng(seed)).cells[0] == UNKNOWN for seed in range(10)]
+    outer = ~inner & (cells[0] == PRESENT)
+    assert np.mean([some[inner].mean() for some in silent]) < 0.3 * np.mean([some[outer].mean() for some in silent])
+
+
+def test_what_is_unknown_before_stays_so_and_counts_in_no_share(quiet):
+    cells = town()
+    cells[:, :, :80] = UNKNOWN
+    view = Evidence(classes=CLASSES, cells=cells, cell_size_m=1.0)
+    spoken = dataclasses.replace(quiet.perception(), silence={})
+    for seed in range(5):
+        before, after = (some(view, np.random.default_rng(seed)).cells for some in (spoken, quiet.perception()))
+        assert (after[:, :, :80] == UNKNOWN).all()
+        absent = (cells[0] == 0) & (before[0] == 0)
+        assert (after[0][absent] == UNKNOWN).mean() == pytest.approx(0.03, abs=0.01)
+
+
+def test_a_perfect_detector_is_not_silent(quiet):
+    view = Evidence(classes=CLASSES, cells=town(), cell_size_m=1.0)
+    assert quiet.perception(error_factor=0.0)(view, np.random.default_rng(1)) is view
+
+
+def test_silence_comes_back_from_its_file(quiet, tmp_path):
+    write_profile(quiet, tmp_path / "quiet.toml")
+    again = read_profile(tmp_path / "quiet.toml")
+    assert again.silence == quiet.silence
+    assert {name: each.silent for name, each in again.classes.items()} == {
+        name: each.silent for name, each in quiet.classes.items()
+    }
+    text = (tmp_path / "quiet.toml").read_text(encoding="utf-8")
+    for old, new in (("silence = 0.05\n", ""), ("alarm = 0.8", "alarm = 1.8")):
+        (tmp_path / "wrong.toml").write_text(text.replace(old, new), encoding="utf-8")
+        with pytest.raises(ConfigError, match=r"silence needs the shares 'silent'|building\.silent\.alarm") as caught:
+            read_profile(tmp_path / "wrong.toml")
+        assert "\n" not in str(caught.value)
+
+
+def test_stored_profiles_without_silence_keep_their_bytes(tmp_path):
+    stored = sorted(Path("docs/results/segmenters/profiles").glob("*.toml"))
+    for path in stored:
+        write_profile(read_profile(path), tmp_path / path.name)
+    assert stored
+    assert [path.name for path in stored if (tmp_path / path.name).read_bytes() != path.read_bytes()] == []
+
+
+def test_the_detector_silent_draws_with_the_profile_that_ships():
+    view = Evidence(classes=(*CLASSES, "waterway"), cells=np.concatenate((town(), town()[1:2])), cell_size_m=1.0)
+    after = perception_of("silent")(view, np.random.default_rng(1))
+    expected = silent_profile().perception()(view, np.random.default_rng(1))
+    np.testing.assert_array_equal(after.cells, expected.cells)
+    assert (after.layer("waterway") == UNKNOWN).all()  # its segmenter does not tell waterways
+    assert 0.01 < (after.layer("building") == UNKNOWN).mean() < 0.3
 
 
 def test_without_a_profile_nothing_changes():

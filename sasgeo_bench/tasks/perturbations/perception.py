@@ -7,6 +7,8 @@ score that the detector reaches on each class.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import resources
 from statistics import NormalDist
 from typing import Final
 
@@ -33,9 +35,9 @@ from sasgeo_bench.tasks.perturbations.base import (
     with_cells,
 )
 from sasgeo_bench.tasks.perturbations.measured import MeasuredPerception
-from sasgeo_bench.tasks.perturbations.perception_profile import PerceptionProfile
+from sasgeo_bench.tasks.perturbations.perception_profile import PerceptionProfile, read_profile
 from sasgeo_bench.tasks.perturbations.streams import Streams
-from sasgeo_bench.tasks.query import PROFILE, Detector
+from sasgeo_bench.tasks.query import PROFILE, SILENT, Detector
 
 TOLERANCE_CELLS: Final = 1.5  # the eight neighbours
 EDGE_M: Final = 4.0  # width of ragged edges
@@ -296,7 +298,22 @@ def _measured(error_factor: float) -> Perturbation:
     return MeasuredPerception(error_factor=error_factor)
 
 
-DETECTORS: Final[Mapping[Detector, Callable[[float], Perturbation]]] = {"published": _published, "measured": _measured}
+@cache
+def silent_profile() -> PerceptionProfile:
+    """Return the profile of the detector "silent", which ships.
+
+    >>> silent_profile().segmenter, silent_profile().silence
+    ('osm_unet_held_out', 0.05)
+    """
+    with resources.as_file(resources.files(__package__) / "silent.toml") as path:
+        return read_profile(path)
+
+
+DETECTORS: Final[Mapping[Detector, Callable[[float], Perturbation]]] = {
+    "published": _published,
+    "measured": _measured,
+    SILENT: lambda error_factor: silent_profile().perception(error_factor),
+}
 
 
 def perception_of(
@@ -313,4 +330,4 @@ def perception_of(
         return DETECTORS[detector](error_factor)
     if profile is None:
         raise ConfigError(NO_PROFILE)
-    return MeasuredPerception(error_factor=error_factor, errors=profile.errors())
+    return profile.perception(error_factor)

@@ -13,7 +13,7 @@ from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
 from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredPerception
 from sasgeo_bench.tasks.perturbations.occlusion import CanopyAndShadow, FalseUnknown, Glare
-from sasgeo_bench.tasks.perturbations.perception import ERRORS, Perception
+from sasgeo_bench.tasks.perturbations.perception import ERRORS, Perception, silent_profile
 from sasgeo_bench.tasks.perturbations.season import Season
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
@@ -22,6 +22,7 @@ RATES = rates_by_hand() | {NEW: Rates(vanish_per_year=0.05, appear_per_year=0.05
 BY_CLASS = (
     Perception(error_factor=1.0),
     MeasuredPerception(error_factor=1.0),
+    MeasuredPerception(error_factor=1.0, silence=silent_profile().perception().silence),
     Glare(share=0.2),
     FalseUnknown(share=0.2),
     CanopyAndShadow(share=0.6),

@@ -9,7 +9,8 @@
 The first command draws views of 192 m of a train place of each train country (split `trials`) of the suites in `DRAWN`,
 learns from the places of the other half, asks each arm, and writes each answer; it resumes. `listed` is whether the
 truth is among the modes that the arm ranked. The last prints the table of stored answers: the share that is found
-within 25 m and 5 degrees, and flips to right and to wrong against `sasgeo_gains`, which ranks by Eq. 11 alone.
+within 25 m and 5 degrees, and flips to right and to wrong against `sasgeo_gains`, which ranks by Eq. 11 alone, or the
+arm of `--against`.
 Intervals are 95 %, by resampling places.
 """
 
@@ -209,8 +210,8 @@ def read_answers(path: Path) -> list[Answer]:
         ]
 
 
-def lines(answers: Sequence[Answer]) -> Iterator[str]:
-    """Yield a row for each arm: what it finds in each group, and how that differs from `USUAL`."""
+def lines(answers: Sequence[Answer], usual: str = USUAL) -> Iterator[str]:
+    """Yield a row for each arm: what it finds in each group, and how that differs from the usual one."""
     of_arm = {arm: {one.query_id: one for one in answers if one.arm == arm} for arm in ARMS}
     of_arm = {arm: own for arm, own in of_arm.items() if own}
     every = list(dict.fromkeys(one.group for one in answers))
@@ -220,8 +221,8 @@ def lines(answers: Sequence[Answer]) -> Iterator[str]:
     for arm, own in of_arm.items():
         cells = [f"{np.median([one.view_s for one in own.values()]):.2f}"]
         for names in wanted.values():
-            asked = [one for one in own.values() if one.group in names and one.query_id in of_arm.get(USUAL, {})]
-            cells.append(_cell(asked, [of_arm[USUAL][one.query_id] for one in asked], with_interval=len(names) > 1))
+            asked = [one for one in own.values() if one.group in names and one.query_id in of_arm.get(usual, {})]
+            cells.append(_cell(asked, [of_arm[usual][one.query_id] for one in asked], with_interval=len(names) > 1))
         yield f"| `{arm}` | {' | '.join(cells)} |"
 
 
@@ -244,6 +245,7 @@ def main() -> None:
     parser.add_argument(
         "--seed", type=int, default=SEED, help="of the views: another one takes other sites of the places"
     )
+    parser.add_argument("--against", default=USUAL, help="arm that the others are compared with")
     parser.add_argument("--table", type=Path, help="print the table of stored answers, and stop")
     options = parser.parse_args()
     try:
@@ -259,7 +261,7 @@ def main() -> None:
                     for one in ask(options.out, arm, done):
                         table.writerow(asdict(one))
                         file.flush()
-        print(*lines(read_answers(options.table or options.out / "answers.csv")), sep="\n")
+        print(*lines(read_answers(options.table or options.out / "answers.csv"), options.against), sep="\n")
     except SasgeoError as error:
         parser.error(str(error))
 

@@ -16,7 +16,7 @@ WORLD = read_split_file(find_split_file("world"))
 TRIALS = read_split_file(find_split_file("trials"))
 TRAIN = {region: place.country for place in WORLD.place if place.part == "train" for region in place.region_ids}
 LARGE_M2 = 5e6
-STORED = ROOT / "docs" / "results" / "joint-trials.csv"
+STORED = tuple(sorted((ROOT / "docs" / "results").glob("joint-trials*.csv")))
 
 
 def read(pipeline):
@@ -36,7 +36,7 @@ def asked_by(pipeline):
         ("open numbers", open_numbers.places()),
         ("trials of the scorer", asked_by(read("scorer-trials"))),
         ("trials of the joint score", joint_trials.DATED),
-        ("joint-trials.csv", {one.place for one in joint_trials.read_answers(STORED)}),
+        *((path.name, {one.place for one in joint_trials.read_answers(path)}) for path in STORED),
         *(
             (path, open_numbers.read_trials(ROOT / "docs" / "results" / path)[0].right_of)
             for path in ("open-numbers.csv", "scorer-trials.csv")

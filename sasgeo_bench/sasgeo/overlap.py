@@ -182,8 +182,8 @@ def overlap_of(compared: Compared, is_line: NDArray[np.bool_], *, is_gated: bool
 
     Lines last, areas are filled and cleared: where a view shows lines well, at the best of all poses, it is they that
     tell places apart. A detector that errs much loses lines first; then areas have all the say they can get. How well
-    lines are seen is told by all their ground as one. Unless it `is_gated`, all classes have their say always. `is_line`
-    has shape (C,).
+    lines are seen is told by all their ground as one. Unless it `is_gated`, all classes have their say always.
+    `is_line` has shape (C,).
 
     Examples
     --------

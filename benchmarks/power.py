@@ -6,7 +6,8 @@
 
 Differences of the two sides of a contrast are those of the pilot's places. Each test place of the split takes those of
 a pilot place by lot, with as many views, drawn with replacement: once all places of a country take them of one pilot
-place ("alike", the worst), once each of its own ("apart"). Then the rule of a board is applied: *shown* where intervals
+place ("alike", the worst), once each of its own ("apart"). Where some places of the pilot have no view, as many of the
+test places have none. Then the rule of a board is applied: *shown* where intervals
 by places and by countries leave out 0 and p over places, by a normal law, is at most 5 % over the number of contrasts
 (the first step of Holm); *equal* where both intervals lie within the least difference that matters. "As in the pilot"
 is how often the difference is shown if the pilot's is the true one; "if equal" how often equality is shown where none
@@ -32,6 +33,7 @@ from sasgeo_bench.tasks.split import SplitFile, find_split_file, read_split_file
 
 SEED, TRIALS, DRAWS, LEVEL = 1, 400, 400, 0.05
 OF_MATCHERS: Final = ("primary", "interaction", "shift")
+PLAIN: Final = ("clean",)  # suites that every place can carry
 DATED: Final = "real-age"  # a suite that has places with maps of several dates alone
 Floats = NDArray[np.float64]
 
@@ -90,7 +92,9 @@ def line(contrast: dict[str, Any], scores: pd.DataFrame, split: SplitFile, criti
     """Return the row of a contrast."""
     gaps = differences(scores, contrast)
     pilot = [own["gap"].to_numpy(float) for _, own in gaps.groupby("place", observed=True)]
-    country_of = list(ranked_places(split, contrast["suites"]).values())
+    every_country = list(ranked_places(split, contrast["suites"]).values())
+    share = len(pilot) / max(len(pilot), scores.loc[scores["suite"].isin(PLAIN), "place"].nunique())
+    count = round((1.0 if DATED in contrast["suites"] else share) * len(every_country))
     name, least = contrast["name"], float(contrast["min_effect"])
     if len(pilot) < 2:  # nothing is known of how places differ
         return f"| {name} | {len(gaps)}, {len(pilot)} | - | | | | | | | |"
@@ -100,6 +104,7 @@ def line(contrast: dict[str, Any], scores: pd.DataFrame, split: SplitFile, criti
         for alike in (True, False):
             found = 0
             for _ in range(TRIALS):
+                country_of = [every_country[at] for at in np.sort(rng.permutation(len(every_country))[:count])]
                 sides = rng.choice([-1.0, 1.0], len(pilot)) if is_swapped else np.ones(len(pilot))
                 some = simulated(
                     [side * gap for side, gap in zip(sides, pilot, strict=True)], country_of, rng, alike=alike
@@ -108,9 +113,9 @@ def line(contrast: dict[str, Any], scores: pd.DataFrame, split: SplitFile, criti
             shares.append(f"{found / TRIALS:.2f}")
     every = np.concatenate(pilot)
     second = gaps[contrast["second"]].mean()
-    views = round(len(every) / len(pilot) * len(country_of))
+    views = round(len(every) / len(pilot) * count)
     return (
-        f"| {name} | {len(every)}, {len(pilot)} | {100 * every.mean():+.1f} | {views}, {len(country_of)} "
+        f"| {name} | {len(every)}, {len(pilot)} | {100 * every.mean():+.1f} | {views}, {count} "
         f"({len(set(country_of))}) | {shares[0]}, {shares[1]} | {shares[2]}, {shares[3]} | {second:.2f} | "
         f"{(every != 0).mean():.2f} | {likeness(pilot):.2f} |"
     )

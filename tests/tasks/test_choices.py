@@ -35,6 +35,7 @@ def asked_by(pipeline):
         ("the split of trials", TRIALS.region_ids),
         ("open numbers", open_numbers.places()),
         ("trials of the scorer", asked_by(read("scorer-trials"))),
+        ("the pilot of the fourth experiment", asked_by(read("places-pilot"))),
         ("trials of the joint score", joint_trials.DATED),
         *((path.name, {one.place for one in joint_trials.read_answers(path)}) for path in STORED),
         *(
@@ -49,7 +50,7 @@ def test_no_choice_rests_on_a_place_outside_train(what, regions):
 
 
 def test_the_pipeline_of_trials_draws_from_their_split_alone():
-    assert read("scorer-trials")["split"] == "trials"
+    assert {read(name)["split"] for name in ("scorer-trials", "places-pilot")} == {"trials"}
 
 
 def test_places_of_trials_keep_their_names_and_countries_and_are_drawn_by_hash():

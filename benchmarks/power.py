@@ -97,7 +97,7 @@ def line(contrast: dict[str, Any], scores: pd.DataFrame, split: SplitFile, criti
     count = round((1.0 if DATED in contrast["suites"] else share) * len(every_country))
     name, least = contrast["name"], float(contrast["min_effect"])
     if len(pilot) < 2:  # nothing is known of how places differ
-        return f"| {name} | {len(gaps)}, {len(pilot)} | - | | | | | | | |"
+        return f"| {name} | {len(gaps)}, {len(pilot)} | - | | | | | | |"
     rng = np.random.default_rng(SEED)
     shares = []
     for wanted, is_swapped in (("shown", False), ("equal", True)):

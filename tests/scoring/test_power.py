@@ -71,4 +71,7 @@ def test_a_row_of_a_pilot_in_which_one_side_always_wins():
     contrast |= {"metric": "primary", "track": "localization", "min_effect": 0.03}
     split = read_split_file(find_split_file("world"))
     found = line(contrast, pd.DataFrame(rows), split, CRITICAL)
+    of_one = line(contrast, pd.DataFrame([row for row in rows if row["place"] == "a"]), split, CRITICAL)
+    assert of_one == "| all | 3, 1 | - | | | | | | |"
+    assert of_one.count("|") == found.count("|")
     assert found == "| all | 12, 4 | +100.0 | 249, 83 (27) | 1.00, 1.00 | 0.00, 0.00 | 0.00 | 1.00 | 0.00 |"

@@ -62,14 +62,16 @@ class TrainingGroups:
 
         In a cross-fit each half is asked after learning from the other. In a hold-out all that is not for training is
         asked after learning from the train places. Tasks of no place, as the paper's, are asked untaught. A sealed
-        place never trains. Of several models each is asked in countries of its own (`models_by_place`); an oracle has
-        one.
+        place never trains. Of several models each is asked in countries of its own (`models_by_place`), the first on
+        tasks of no place, as controls are; an oracle has one.
         """
         groups = {task: self._group_of(task) for task in tasks}
         names = [HELD_OUT] if is_holdout(self.split) else [f"half {half}" for half in HALVES]
         none = f"no {'part' if is_holdout(self.split) else 'half'}"
         count = 1 if is_oracle else self.learning.models
-        model_of = {task: self._model_of(task, count) for task in asked}
+        models = models_by_place(self.split, count)
+        places_of = {task: self.split.places_in(base_of(task.name)) for task in asked}
+        model_of = {task: next(map(models.__getitem__, places), 0) for task, places in places_of.items()}
         found = [
             TrainingGroup(
                 name=(name or none) + (f", model {model + 1} of {count}" if name and count > 1 else ""),
@@ -81,11 +83,6 @@ class TrainingGroups:
             for model in range(count if name else 1)
         ]
         return [group for group in found if group.asked]
-
-    def _model_of(self, task: Path, count: int) -> int:
-        """Return the model that answers a task; the first those of no place, as controls are."""
-        models = models_by_place(self.split, count)
-        return next((models[place] for place in self.split.places_in(base_of(task.name))), 0)
 
     def _teaches(self, task: Path, group: str | None, name: str, is_oracle: bool) -> bool:  # noqa: FBT001
         """Return whether a task trains for a group of places."""

@@ -5,9 +5,12 @@ from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
+
 import sasgeo_bench as sgb
 from benchmarks import joint_trials
 from benchmarks.joint_trials import ARMS, USUAL, Answer, lines, read_answers
+from benchmarks.joint_weights import Modes, settings
 from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.variants import Sasgeo
 
@@ -69,3 +72,23 @@ def test_what_stands_finds_more_with_errors_and_loses_nowhere_beyond_one_view():
     won = Counter(group for group, query in ours if ours[group, query] and not usual[group, query])
     assert max(lost.values(), default=0) <= 1
     assert all(won[group] > lost[group] + 5 for group in ("clean x3", "clean x4", "volatile-lure"))
+
+
+def test_by_hand_what_a_gate_and_weights_would_find_among_two_modes():
+    view = Modes(
+        group="clean x4",
+        right=np.array([True, False]),
+        terms=np.array([0.0, 1.0]),
+        unlike=np.array([0.5, 0.0]),
+        overlaps=np.array([[0.1, 0.6], [0.2, 0.2]]),  # lines, then areas
+        both=np.array([[10.0, 60.0], [20.0, 20.0]]),
+        either=np.full((2, 2), 100.0),
+        is_line=np.array([True, False]),
+        weights=(1.0, 10.0),
+    )
+    assert view.lines_seen(as_one=True) == view.lines_seen(as_one=False) == 0.2
+    assert view.finds(say=1.0)  # 7.0 - 0.5 against 1.0 + 4.0
+    assert not view.finds(say=0.0)
+    assert not view.finds(say=1.0, amount=8.0)
+    assert not view.finds(say=1.0, overlap=0.1)
+    assert {name: bool(finds(view)) for name, finds in settings()}["areas never count"] is False

@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.power import ends, likeness, line, outcome, ranked_places, simulated
+from benchmarks.power import Asked, ends, likeness, line, outcome, ranked_places, simulated, swapped
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 
 CRITICAL = 1.96
@@ -13,13 +13,27 @@ UNITS = ("country", "place", "block")
 COUNTRIES = [f"country-{at // 2}" for at in range(20)]
 
 
-def gaps(*values, views=10):
-    return [np.full(views, value) for value in values]
+def gaps(*values, views=10, sites=10):
+    return [Asked(np.full(views, value), sites) for value in values]
 
 
 @pytest.mark.parametrize(("value", "word"), [(1.0, "shown"), (-1.0, "shown"), (0.0, "equal"), (0.02, "shown")])
 def test_what_every_place_says_is_found(value, word):
     assert outcome(gaps(*[value] * 20), COUNTRIES, 0.03, CRITICAL, np.random.default_rng(0)) == word
+
+
+@pytest.mark.parametrize(("sites", "word"), [(1, "open"), (10, "equal")])
+def test_equality_takes_sites_where_no_view_differs(sites, word):
+    same = gaps(*[0.0] * 80, sites=sites)
+    countries = [f"country-{at // 3}" for at in range(80)]
+    assert outcome(same, countries, 0.03, CRITICAL, np.random.default_rng(0)) == word
+
+
+def test_equal_sides_of_which_no_view_differs_get_one_each_way():
+    found = [one.gaps for one in swapped(gaps(*[0.0] * 5), np.random.default_rng(0))]
+    assert sorted(np.abs(gap).sum() for gap in found) == [0, 0, 0, 1, 1]
+    lost = [one.gaps.sum() for one in swapped(gaps(*[1.0] * 40), np.random.default_rng(0))]
+    assert set(lost) == {10.0, -10.0}
 
 
 def test_places_that_disagree_leave_it_open():
@@ -36,14 +50,16 @@ def test_countries_that_differ_are_more_uncertain_than_their_places():
 
 def test_alike_places_of_a_country_take_from_one_pilot_place():
     pilot, rng = gaps(0.0, 1.0, 2.0, views=3), np.random.default_rng(1)
-    drawn = [float(gap[0]) for gap in simulated(pilot, COUNTRIES, rng, alike=True)]
-    assert drawn[::2] == drawn[1::2]
-    apart = [float(gap[0]) for gap in simulated(pilot, COUNTRIES, rng, alike=False)]
+    drawn = simulated(pilot, COUNTRIES, rng, times=2, alike=True)
+    assert {(len(one.gaps), one.sites) for one in drawn} == {(6, 20)}
+    first = [float(one.gaps[0]) for one in drawn]
+    assert first[::2] == first[1::2]
+    apart = [float(one.gaps[0]) for one in simulated(pilot, COUNTRIES, rng, times=1, alike=False)]
     assert apart[::2] != apart[1::2]
 
 
 def test_likeness_is_one_where_places_alone_differ_and_none_where_views_do():
-    assert likeness(gaps(0.0, 1.0, 0.0, 1.0)) == pytest.approx(1.0)
+    assert likeness([one.gaps for one in gaps(0.0, 1.0, 0.0, 1.0)]) == pytest.approx(1.0)
     assert likeness([np.array([0.0, 1.0] * 5)] * 4) == 0.0
 
 

@@ -92,7 +92,10 @@ def changed_maps(request: Request, base: Region, flights: Mapping[int, Flight]) 
 
 
 def nothing_to_ask(request: Request, suite: Suite, reasons: Counter[str | None]) -> ConfigError:
-    """Return an error that gives the most frequent reason why no query can be asked."""
+    """Return an error that gives the most frequent reason why no query can be asked; none if no view is chosen."""
+    if not reasons:
+        why = "its views are of other sizes, kinds or tracks than those asked for"
+        return ConfigError(f"{request.region.id} has nothing of suite {suite.card.name!r} that is wanted: {why}")
     reason = reasons.most_common(1)[0][0]
     where = f"{request.region.id} is too small or too empty"
     if request.flown is not None:

@@ -2,6 +2,7 @@
 """Many requests: no query hangs on how many processes draw, nor on which variants are left out."""
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
@@ -53,6 +54,17 @@ def test_two_processes_draw_the_queries_that_one_draws_and_tell_what_a_region_la
     again = list(carry_out(wanted(tmp_path / "two", "clean", choice=few)))
     assert [item.folders for item in again] == [item.folders for item in two]
     assert not any(item.lines for item in again)
+
+
+@pytest.mark.parametrize("suite", ["clean", "occlusion"])
+def test_a_region_that_allows_no_view_of_the_asked_size_is_left_out(suite, tmp_path, lay_towns):
+    lay_towns(tmp_path, TOWNS[0])
+    large = max(find_suite(suite).variants, key=lambda variant: variant.view_cells)
+    (request,) = wanted(tmp_path, suite, regions=TOWNS[:1], choice=Choice(views_cells=(large.view_cells,)))
+    small = replace(request, region=request.region.model_copy(update={"largest_view_m": large.side_m - 1.0}))
+    (found,) = carry_out([small])
+    assert found.folders == ()
+    assert found.lack.startswith("town-suburb has nothing of suite")
 
 
 def test_what_is_left_out_changes_no_other_query(tmp_path, lay_towns):

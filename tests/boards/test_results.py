@@ -10,6 +10,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from benchmarks.rescored import differences, rescored
 from sasgeo_bench.boards.archive import stored_settings
 from sasgeo_bench.boards.archive_file import MOST_BYTES
 from sasgeo_bench.boards.pipeline_spec import find_pipeline_file, read_pipeline_file
@@ -37,6 +38,23 @@ def test_results_are_of_the_pipeline_as_it_is_registered(name):
     assert stored_settings([RESULTS / name]).pipeline == spec.identity
     record = json.loads((RESULTS / name / "board.json").read_text(encoding="utf-8"))
     assert {entry["name"] for entry in record["entries"]} >= set(spec.matchers) - {"oracle_pose"}
+
+
+def test_a_stored_board_is_scored_again_alike(tmp_path):
+    """The smallest one; a workflow does so with each of them every month."""
+    assert rescored(RESULTS / "systems-pictures", tmp_path / "out") == []
+
+
+def test_a_board_that_says_something_else_is_found(tmp_path):
+    stored = RESULTS / "systems-pictures"
+    for name in ("leaderboard", "scores"):
+        table = pd.read_parquet(stored / f"{name}.parquet")
+        column = "value" if name == "leaderboard" else "position_error_m"
+        table.loc[table[column].first_valid_index(), column] += 0.01
+        table.to_parquet(tmp_path / f"{name}.parquet")
+    figure, column = differences(stored, tmp_path)
+    assert ", now " in figure
+    assert column == "column position_error_m of scores.parquet"
 
 
 def test_results_are_small():

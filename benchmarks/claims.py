@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Print the tables of the page of claims (`docs/results/README.md`) from stored boards, and draw its figure.
+
+    python -m benchmarks.claims docs/results/places docs/results/places-silent --figure docs/figures/claims.svg
+
+The first board is that of the experiment; contrasts of the others stand below its own. Tables are of Markdown, figures
+in hundredths ("points") with intervals of 95 %: by countries where there are six, else by places. Verdicts are the
+board's: *yes*, *no* (the other side is better), *equal* (the interval lies within what was registered to matter),
+*smaller than matters*, or *not decided*. Scenes, sealed places and places that were tried before are described, without
+a test.
+"""
+
+import argparse
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+
+from sasgeo_bench.boards.board import Board, read_board
+from sasgeo_bench.core.errors import SasgeoError
+from sasgeo_bench.scoring.compare import Finding
+
+SCORER, BEFORE, PLAIN = "sasgeo", "sasgeo_gains", "sasgeo_raster"
+OWN: Final = "sasgeo"  # names of variants begin with it
+FOUND: Final = "success_25m"
+TRIED: Final = ("krems", "london", "vaduz")  # the scorer was tried there before its numbers were chosen on train places
+LEAST_VIEWS: Final = 20  # of a scene
+POOR: Final = 0.05  # share of a view that is mapped
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """A goal that was set beforehand: rows of the leaderboard, and the figure to reach."""
+
+    what: str
+    suite: str
+    stratum: str
+    wanted: float
+
+
+GOALS: Final = (
+    Goal("clean views at 0.5 to 4 times the error", "clean", "perception", 0.844),
+    Goal("maps of ten years", "real-age", "S1 10, 192 cells", 0.874),
+    Goal("lures with today's fields and sheds", "volatile-lure", "S2", 0.713),
+)
+
+
+def points(value: float, lo: float, hi: float) -> str:
+    """Return a difference in points with its interval.
+
+    >>> points(0.1804, 0.088, 0.28)
+    '+18.0 [8.8, 28.0]'
+    """
+    return f"{100 * value:+.1f} [{100 * lo:.1f}, {100 * hi:.1f}]"
+
+
+def share(row: "pd.Series | None") -> str:
+    """Return a share with its interval; a dash without a row."""
+    return "-" if row is None else f"{row['value']:.3f} [{row['lo']:.2f}, {row['hi']:.2f}]"
+
+
+def verdict(found: Finding) -> str:
+    """Return what a contrast says, in words of the page."""
+    within = f"equal within {100 * found.least:g} points"
+    words = {"decided": "yes", "cause open": "yes", "null": within, "decided, small": "smaller than matters"}
+    word = words.get(found.outcome, "not decided")
+    return "no: the second is better" if word == "yes" and found.winner == found.second else word
+
+
+def contrast_rows(board: Board) -> Iterator[str]:
+    """Yield a row for each registered contrast."""
+    for found in board.findings:
+        lo, hi = found.ends
+        where = f"{found.places} ({found.countries})" if found.countries else str(found.places)
+        only = f"{found.first_only}, {found.second_only}" if found.first_only + found.second_only else "-"
+        yield (
+            f"| {found.name} | `{found.first}`: {found.first_value:.3f} | `{found.second}`: {found.second_value:.3f} | "
+            f"{points(found.difference, lo, hi)} | {only} | {found.n} | {where} | {found.p_holm:.3f} | "
+            f"**{verdict(found)}** |"
+        )
+
+
+def contrasts(boards: Sequence[Board]) -> list[str]:
+    """Return the table of registered contrasts."""
+    head = ["contrast", "first", "second", "gain, points", "won, lost", "views", "places (countries)", "p (Holm)", ""]
+    return [*begun(head), *(row for board in boards for row in contrast_rows(board))]
+
+
+def begun(head: Sequence[str]) -> list[str]:
+    """Return the first two lines of a table."""
+    return [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
+
+
+def rows_of(board: Board, suite: str, stratum: str) -> pd.DataFrame:
+    """Return rows of the leaderboard of what was found in a suite, by matcher; controls are left out."""
+    table = board.leaderboard
+    chosen = table[(table["suite"] == suite) & (table["stratum"] == stratum) & (table["metric"] == FOUND)]
+    return chosen[(chosen["rejector"] == "") & ~chosen["is_control"].astype(bool)].set_index("matcher")
+
+
+def one_of(rows: pd.DataFrame, matcher: str) -> "pd.Series | None":
+    """Return the row of a matcher, if it was asked."""
+    return rows.loc[matcher] if matcher in rows.index else None
+
+
+def suites(board: Board) -> list[str]:
+    """Return the table of what is found under stress in each suite, beside the best rival and the plain raster."""
+    lines = begun(
+        ["suite", "views, places", "`sasgeo`", "its rank", "best of other systems", "`sasgeo_gains`", "plain raster"]
+    )
+    for suite in dict.fromkeys(board.leaderboard["suite"]):
+        rows = rows_of(board, suite, "stress")
+        mine = one_of(rows, SCORER)
+        if mine is None or math.isnan(mine["value"]):
+            continue
+        others = rows[~rows.index.str.startswith(OWN)].sort_values("value", ascending=False)
+        best = f"`{others.index[0]}`: {share(others.iloc[0])}" if len(others) else "-"
+        rank = "-" if pd.isna(mine["rank_best"]) else ranks(int(mine["rank_best"]), int(mine["rank_worst"]), len(rows))
+        lines.append(
+            f"| {suite} | {mine['n']}, {mine['places']} | {share(mine)} | {rank} | {best} | "
+            f"{share(one_of(rows, BEFORE))} | {share(one_of(rows, PLAIN))} |"
+        )
+    return lines
+
+
+def ranks(best: int, worst: int, count: int) -> str:
+    """Return the set of ranks that a matcher may have.
+
+    >>> ranks(1, 3, 9), ranks(2, 2, 9)
+    ('1-3 of 9', '2 of 9')
+    """
+    return f"{best} of {count}" if best == worst else f"{best}-{worst} of {count}"
+
+
+def steps(board: Board, suite: str) -> list[str]:
+    """Return the table of what is found at each step of a suite, by matcher, the best first."""
+    table = board.leaderboard
+    names = list(dict.fromkeys(table.loc[(table["suite"] == suite), "stratum"]))
+    every = {name: rows_of(board, suite, name) for name in names if name.endswith("192 cells")}
+    every = {name: rows for name, rows in every.items() if len(rows)}
+    asked = rows_of(board, suite, "stress").sort_values("value", ascending=False).index
+    counts = [int(rows["n"].max()) for rows in every.values()]
+    head = [f"{name.removesuffix(', 192 cells')}, n = {count}" for name, count in zip(every, counts, strict=True)]
+    lines = begun(["matcher", *head])
+    return lines + [
+        f"| `{name}` | {' | '.join(share(one_of(rows, name)) for rows in every.values())} |" for name in asked
+    ]
+
+
+def goals(board: Board) -> list[str]:
+    """Return the table of goals."""
+    lines = begun(["goal", "wanted", "`sasgeo`", ""])
+    for goal in GOALS:
+        mine = one_of(rows_of(board, goal.suite, goal.stratum), SCORER)
+        if mine is not None:
+            word = "reached" if mine["value"] >= goal.wanted else "missed"
+            lines.append(f"| {goal.what} | {goal.wanted:.3f} | {share(mine)} of {mine['n']} | {word} |")
+    return lines
+
+
+def views(board: Board) -> pd.DataFrame:
+    """Return the views under stress of a board, with whether each was found."""
+    scores = board.scores
+    rows = scores[(scores["role"] == "stress") & scores["is_present"] & (scores["track"] == "localization")]
+    rows = rows[~rows["kind"].str.startswith("unrivalled")]
+    return rows.assign(found=(rows["position_error_m"] <= 25) & (rows["yaw_error_deg"] <= 5))
+
+
+def scenes(board: Board, matchers: Sequence[str]) -> list[str]:
+    """Return the table of what is found of clean views by scene, and in country that is poor of features."""
+    rows = views(board)
+    rows = rows[(rows["suite"] == "clean") & rows["matcher"].isin(matchers)]
+    poor = rows[rows["feature_density"] < POOR].assign(scene=f"poor of features (under {100 * POOR:g} % mapped)")
+    both = pd.concat([rows.assign(scene=rows["scene"].astype(str).str.split(",")).explode("scene"), poor])
+    lines = begun(["scene", "views, places", *(f"`{name}`" for name in matchers)])
+    for scene, mine in both.groupby("scene", observed=True):
+        first = mine[mine["matcher"] == matchers[0]]
+        if len(first) >= LEAST_VIEWS:
+            figures = (f"{mine.loc[mine['matcher'] == name, 'found'].mean():.3f}" for name in matchers)
+            lines.append(f"| {scene} | {len(first)}, {first['place'].nunique()} | {' | '.join(figures)} |")
+    return lines
+
+
+def apart(board: Board) -> list[str]:
+    """Return the table of contrasts by success at the sealed places, and without those that were tried before."""
+    rows, sealed = views(board), set(board.about.sealed)
+    groups = {
+        "sealed": rows[rows["place"].isin(sealed)],
+        "without " + ", ".join(TRIED): rows[~rows["place"].isin(TRIED)],
+    }
+    lines = begun(["contrast", *(f"{name}: gain, points; views, places" for name in groups)])
+    for found, contrast in zip(board.findings, board.about.contrasts, strict=True):
+        if contrast.metric != "primary":
+            continue
+        cells = []
+        for some in groups.values():
+            chosen = some[some["suite"].isin(contrast.suites) & some["kind"].str.startswith(contrast.kinds or "")]
+            if contrast.detectors:
+                chosen = chosen[chosen["detector"].isin(contrast.detectors)]
+            chosen = chosen[chosen["matcher"].isin((found.first, found.second))]
+            both = chosen.pivot_table(index=["query_id", "place"], columns="matcher", values="found")
+            if both.shape[1] < 2:
+                cells.append("-")
+                continue
+            pair = both[[found.first, found.second]].dropna().astype(float)
+            gain = 100 * (pair[found.first] - pair[found.second]).mean()
+            cells.append(f"{gain:+.1f}; {len(pair)}, {pair.reset_index()['place'].nunique()}")
+        lines.append(f"| {found.name} | {' | '.join(cells)} |")
+    return lines
+
+
+def tables(boards: Sequence[Board]) -> dict[str, list[str]]:
+    """Return every table of the page, by name."""
+    first = boards[0]
+    there = set(first.scores["suite"])
+    return {
+        "contrasts": contrasts(boards),
+        "suites": suites(first),
+        "goals": goals(first),
+        **{suite: steps(first, suite) for suite in ("clean", "real-age") if suite in there},
+        "scenes": scenes(
+            first, [name for name in (SCORER, "schmidt_segcorr", PLAIN) if name in set(first.scores["matcher"])]
+        ),
+        "apart": apart(first),
+    }
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("boards", type=Path, nargs="+", help="folders of stored boards, that of the experiment first")
+    parser.add_argument("--figure", type=Path, help="file for the contrasts of the first board, as SVG, PDF or PNG")
+    asked = parser.parse_args()
+    try:
+        boards = [read_board(path) for path in asked.boards]
+    except SasgeoError as error:
+        parser.error(str(error))
+    for name, lines in tables(boards).items():
+        print(f"{name}\n", *lines, "", sep="\n")
+    if asked.figure is not None:
+        boards[0].plot_contrasts().savefig(asked.figure)
+
+
+if __name__ == "__main__":
+    main()

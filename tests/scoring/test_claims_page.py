@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from benchmarks.claims import GOALS, apart, contrasts, goals, points, scenes, steps, suites, verdict
+from benchmarks.claims import GOALS, apart, contrasts, goals, listed, points, scenes, steps, suites, verdict
 from sasgeo_bench.boards.board import read_board
 from sasgeo_bench.scoring.compare import Finding
 
@@ -69,3 +69,11 @@ def test_steps_are_in_the_order_of_the_suite_and_scenes_have_enough_views(board)
 def test_sealed_places_stand_apart(board):
     (line,) = [line for line in apart(board) if line.startswith("| graph-junctions |")]
     assert line == "| graph-junctions | +16.7; 24, 8 | +29.5; 105, 31 |"
+
+
+def test_what_is_found_is_listed_and_what_is_listed_is_no_less(board):
+    _, _, *rows = listed(board, ["sasgeo", "schmidt_segcorr"])
+    assert rows[0] == "| clean, 0.5 | 70 | 1.000, 1.000 | 0.943, 0.900 |"
+    pairs = [tuple(map(float, cell.split(","))) for row in rows for cell in row.split("|")[3:-1] if "." in cell]
+    assert len(pairs) > 5
+    assert all(there >= right for there, right in pairs)

@@ -159,9 +159,8 @@ def goals(board: Board) -> list[str]:
     for goal in GOALS:
         mine = one_of(rows_of(board, goal.suite, goal.stratum), SCORER)
         if mine is not None:
-            lines.append(
-                f"| {goal.what} | {goal.wanted:.3f} | {share(mine)} of {mine['n']} | {met(mine['value'], goal.wanted)} |"
-            )
+            word = met(mine["value"], goal.wanted)
+            lines.append(f"| {goal.what} | {goal.wanted:.3f} | {share(mine)} of {mine['n']} | {word} |")
     rows = rows_of(board, *TWINS)
     mine, others = one_of(rows, SCORER), rows.loc[~rows.index.str.startswith(OWN), "value"].sort_values()
     if mine is not None and len(others):
@@ -191,7 +190,11 @@ def listed(board: Board, matchers: Sequence[str]) -> list[str]:
     """
     rows = views(board)
     rows = rows[rows["suite"].isin(SEARCHED) & rows["matcher"].isin(matchers)]
-    answers = pd.read_parquet(board.folder / "predictions.parquet", columns=["query_id", "matcher", "candidates"])
+    answers = pd.read_parquet(
+        board.folder / "predictions.parquet",
+        columns=["query_id", "matcher", "candidates"],
+        filters=[("matcher", "in", list(matchers)), ("query_id", "in", sorted(set(rows["query_id"])))],
+    )
     truths = pd.read_parquet(
         board.folder / "truths.parquet", columns=["query_id", "easting_m", "northing_m", "yaw_deg"]
     )

@@ -53,7 +53,7 @@ def test_the_own_confidence_of_a_system_comes_before_the_margin():
     assert lines == ["90 (80 to 95)", "70 (60 to 75)", "-"]
 
 
-@pytest.mark.parametrize(("board", "system", "column"), [("claims", "sasgeo", 2), ("flights", "swapf", 4)])
+@pytest.mark.parametrize(("board", "system", "column"), [("modules", "sasgeo", 2), ("flights", "swapf", 4)])
 def test_a_stored_board_has_a_row_for_each_system_and_no_control(board, system, column):
     head, _, *rows = related_work.lines(*related_work.read_board(RESULTS / board))
     cells = {row.split("`")[1]: row.split("|") for row in rows}
@@ -69,7 +69,7 @@ def test_a_folder_that_is_no_board_is_reported_in_one_line(tmp_path, capsys):
 
 
 def test_rejection_is_of_one_prior_group_that_nearly_all_views_have():
-    _, rows = related_work.read_board(RESULTS / "claims")
+    _, rows = related_work.read_board(RESULTS / "modules")
     assert set(rows["prior_group"]) == {related_work.PRIOR}
     assert not rows.duplicated(["matcher", "metric", "rejector"]).any()
 
@@ -83,7 +83,7 @@ def test_the_tracker_of_a_system_has_its_row_where_the_matcher_was_not_asked():
 
 
 def test_columns_of_the_board_have_its_own_intervals():
-    board = RESULTS / "claims"
+    board = RESULTS / "modules"
     _, figures = related_work.read_board(board)
     row = pd.read_parquet(board / "leaderboard.parquet").query(
         "metric == 'within_25m' and suite == 'clean' and stratum == 'stress' and matcher == 'sasgeo'"

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(not BOARDS, reason="no results are stored yet")
 
 
 def test_there_are_results_of_the_registered_experiment():
-    assert {"claims", "modules"} <= set(BOARDS)
+    assert {"places", "modules"} <= set(BOARDS)
 
 
 @pytest.mark.parametrize("name", BOARDS)
@@ -217,12 +217,6 @@ def test_the_verdicts_that_the_pages_put_into_words_are_those_of_the_boards():
             **dict.fromkeys(("graph-levels", "graph-warp", "learned-age", "prior-age", "prior-lure"), "not decided"),
             **dict.fromkeys(("age", "unknown", "correlation", "shift"), "not decided"),
             **dict.fromkeys(("rejection-alias", "rejection-absent"), "not decided"),
-        },
-        "claims": {
-            **dict.fromkeys(("graph-warp", "graph-junctions", "graph-instances", "graph-levels", "unknown"), "decided"),
-            **dict.fromkeys(("stability-age", "stability-lure", "rejection-alias"), "not decided"),
-            **dict.fromkeys(("age", "age-interaction", "old-maps", "age-fresh"), "not decided"),
-            "rejection-absent": "null",
         },
         "flights": {
             **dict.fromkeys(("odometry", "stability"), "cause open"),

@@ -699,7 +699,6 @@ def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
 @pytest.mark.parametrize(
     ("small", "large", "may_differ"),
     [
-        ("towns", "claims", {"id", "title", "regions"}),
         ("paper-poc", "paper-poc-20", {"id", "title", "paper"}),
     ],
 )

@@ -9,6 +9,7 @@ from typing import Final, Self
 import pandas as pd
 from matplotlib.figure import Figure
 
+from sasgeo_bench.boards.archive_file import is_pack
 from sasgeo_bench.boards.board_files import (
     LEADERBOARD,
     MEND,
@@ -34,7 +35,7 @@ from sasgeo_bench.boards.plots import (
     shown_matchers,
 )
 from sasgeo_bench.boards.pooled_plots import draw_contrasts, draw_tradeoff, price_frame
-from sasgeo_bench.boards.stored_frames import levels_of, measured_of
+from sasgeo_bench.boards.stored_frames import check_stored, levels_of, measured_of
 from sasgeo_bench.core.canvas import on_paper
 from sasgeo_bench.core.errors import ConfigError, counted
 from sasgeo_bench.core.parquet import read_frame
@@ -240,10 +241,12 @@ class Board:
         with on_paper(width_mm):
             return draw_risk(None, rows, shown)
 
-    def plot_age(
+    def plot_steps(
         self, suite: str, prior_group: str, *, track: str = "localization", width_mm: float | None = None
     ) -> Figure:
-        """Draw success against the age of the map, where ages were measured, or else against what was done.
+        """Draw success step by step: against the age of the map where ages were measured, else against the strength.
+
+        Ages stand in stored results; of other boards the steps are those that were asked for.
 
         Parameters
         ----------
@@ -259,13 +262,13 @@ class Board:
         Raises
         ------
         ConfigError
-            If the suite has no steps there, or the board is not read from stored results, which hold the ages.
+            If the suite has no steps there.
 
         Examples
         --------
         >>> import sasgeo_bench as sgb
         >>> board = sgb.read_board("docs/results/modules")  # doctest: +SKIP
-        >>> board.plot_age("real-age", "r500-weak-s3", width_mm=85).savefig("age.pdf")  # doctest: +SKIP
+        >>> board.plot_steps("real-age", "r500-weak-s3", width_mm=85).savefig("age.pdf")  # doctest: +SKIP
         """
         shown, queries = self._shown(self.scores["matcher"]), queries_of(by_entry(self.scores))
         steps = steps_frame(self.leaderboard, queries, shown)
@@ -273,7 +276,7 @@ class Board:
             steps = steps[steps[column] == value]
         if steps.empty:
             raise ConfigError(f"{self.folder} has no steps of {suite!r}, {track}, {prior_group!r}: {_LISTED}")
-        ages = ages_frame(steps, queries, measured_of(self.folder))
+        ages = ages_frame(steps, queries, measured_of(self.folder) if is_pack(self.folder) else {})
         with on_paper(width_mm):
             return draw_steps(None, steps, shown) if ages.empty else draw_ages(None, ages, shown)
 
@@ -337,6 +340,7 @@ class Board:
         >>> board = sgb.read_board("docs/results/modules")  # doctest: +SKIP
         >>> board.plot_stanford("r500-weak-s3", width_mm=85).savefig("stanford.pdf")  # doctest: +SKIP
         """
+        check_stored(self.folder)
         scores = by_entry(self.scores)
         shown = [name for name in self._shown(self.scores["matcher"]) if matcher in {None, name}]
         split = None if self.about.split is None else find_split(self.about.split)

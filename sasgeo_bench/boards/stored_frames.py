@@ -27,8 +27,7 @@ def check_stored(folder: Path) -> None:
 
 
 def measured_of(folder: Path) -> dict[str, Mapping[str, float]]:
-    """Return the measurements of the truths of stored results by query id; raise as `check_stored`, or `StoreError`."""
-    check_stored(folder)
+    """Return the measurements of the truths of stored results by query id; raise `StoreError` if they are damaged."""
     rows = read_table(folder / _TRUTHS, columns=["query_id", "measured"], mend=_MEND).to_pylist()
     return {row["query_id"]: dict(row["measured"] or ()) for row in rows}
 
@@ -44,9 +43,8 @@ def levels_of(
 ) -> dict[tuple[str, str], ProtectionLevels]:
     """Return protection levels of stored results by matcher and method, of one prior group and risk.
 
-    Raise as `check_stored`, or `StoreError`.
+    Raise `StoreError` if they are damaged.
     """
-    check_stored(folder)
     found: dict[tuple[str, str], ProtectionLevels] = {}
     for matcher in shown:
         mine = scores[matcher]

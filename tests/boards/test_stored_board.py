@@ -86,8 +86,8 @@ ON_PAPER = {
     "contrasts": lambda board: board("towns").plot_contrasts(width_mm=85),
     "forest": lambda board: board("towns").plot_forest(_first_contrast(board("towns")), width_mm=85),
     "risk": lambda board: board("towns").plot_risk(GROUP, width_mm=85),
-    "age": lambda board: board("modules").plot_age("real-age", GROUP, width_mm=85),
-    "strength": lambda board: board("modules").plot_age("occlusion", GROUP, width_mm=85),
+    "age": lambda board: board("modules").plot_steps("real-age", GROUP, width_mm=85),
+    "strength": lambda board: board("modules").plot_steps("occlusion", GROUP, width_mm=85),
     "distance": lambda board: board("flights").plot_distance("flight-gap", GROUP, width_mm=85),
     "stanford": lambda board: board("modules").plot_stanford(GROUP, matcher="sasgeo", width_mm=85),
 }
@@ -145,7 +145,7 @@ def test_a_width_that_no_paper_has_is_refused(board, width_mm):
     ("ask", "fault"),
     [
         (lambda board: board.plot_forest("no-such"), r"has no answered contrast 'no-such': it has "),
-        (lambda board: board.plot_age("no-such", GROUP), r"has no steps of 'no-such', localization, 'r500-weak-s3'"),
+        (lambda board: board.plot_steps("no-such", GROUP), r"has no steps of 'no-such', localization, 'r500-weak-s3'"),
         (lambda board: board.plot_distance("clean", GROUP), r"has no flights of 'clean', 'r500-weak-s3': the columns"),
         (lambda board: board.plot_stanford("r1-weak-s3"), r"has no protection levels at risk 0.01 of any matcher"),
         (

@@ -257,7 +257,7 @@ def page(path: Path | None, about: Page) -> Iterator[list[list[Axes]]]:
     """Yield the panels of a figure, row by row; write it as .svg or .png, if there is a path, when the block ends."""
     paper = _paper_inches.get()
     if paper:  # its letters are smaller, and so may its panels be
-        wide = paper / about.columns - 0.42
+        wide = paper / about.columns - 0.5
         about = replace(about, panel_inches=(wide, _SMALLER * about.panel_inches[1]))
     wide, high = about.panel_inches
     with styled():
@@ -267,7 +267,8 @@ def page(path: Path | None, about: Page) -> Iterator[list[list[Axes]]]:
         charts = figure.framed(about).subplots(about.rows, about.columns, squeeze=False)
         yield charts.tolist()
         for chart in charts.flat:
-            chart.set_title(broken(chart.get_title("left"), wide, mpl.rcParams["axes.titlesize"]))
+            title = chart.get_title("left").replace(" %", "\0%") if paper else chart.get_title("left")
+            chart.set_title(broken(title, wide, mpl.rcParams["axes.titlesize"]).replace("\0", " "))
         figure.fit(charts[0, 0], charts[-1, -1], about)
         if path is not None:
             figure.write(path, about)

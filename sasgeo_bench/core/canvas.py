@@ -203,6 +203,8 @@ class PlainFigure(Figure):
         height += about.rows * (about.panel_inches[1] - box.height / self.dpi)
         self.set_size_inches(_paper_inches.get() or max(width, _LEAST_WIDTH), height)
         self.arrange()
+        if _paper_inches.get():  # of another height axes may have other ticks, whose labels are wider
+            self.arrange()
         self.set_layout_engine("none")
 
     def arrange(self) -> None:

@@ -37,7 +37,7 @@ from sasgeo_bench.boards.plots import (
     ticks_across,
 )
 from sasgeo_bench.boards.tables import prior_words
-from sasgeo_bench.core.canvas import figure_of, page, panels
+from sasgeo_bench.core.canvas import broken, figure_of, page, panels, paper_inches
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
@@ -61,6 +61,7 @@ MOST_ERROR_M: Final = 2000.0
 _RADII_M: Final = np.unique(np.concatenate((np.geomspace(LEAST_ERROR_M, MOST_ERROR_M, 87), [5.0, 10.0, FIX_M])))
 _RATIOS: Final = np.unique(np.concatenate((np.geomspace(1.0, 200.0, 47), COST_RATIOS)))
 _NO_INTERVAL: Final = (np.nan, np.nan)
+_NAMES_OF_PAPER, _PAPER_POINTS = 0.42, 7.0  # share of a column that names may take, and their size
 
 
 class _Panel(NamedTuple):
@@ -549,6 +550,11 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
     Return the figure, written where there is a path.
     """
     rows = contrasts[contrasts["n"] > 0].to_dict("records")
+    labels = [f"{row['name']}: {row['first']} - {row['second']}" for row in rows]
+    wide = _NAMES_OF_PAPER * paper_inches()
+    if wide:  # the pair stands below the name
+        labels = [broken(label.replace(": ", ":\n", 1), wide, _PAPER_POINTS) for label in labels]
+    lines = max((label.count("\n") + 1 for label in labels), default=1)
     about = BoardPage(
         title="Registered contrasts",
         note=(
@@ -557,7 +563,7 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
             "differences smaller than was registered to matter; an interval within it rules out those that do."
         ),
         below="difference (shares; of other metrics in their unit)",
-        panel_inches=(4.6, 0.4 + 0.28 * len(rows)),
+        panel_inches=(4.6, 0.4 + max(0.28, 0.15 * lines) * len(rows)),
     )
     with page(path, about) as charts:
         chart = charts[0][0]
@@ -567,7 +573,6 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
             chart.hlines(at, row["lo"], row["hi"], color=colour, lw=1.6)
             chart.plot(row["difference"], at, marker="s", color=colour, ms=4.5, ls="")
         chart.axvline(0.0, color="#000000", lw=0.8)
-        labels = [f"{row['name']}: {row['first']} - {row['second']}" for row in rows]
         chart.set_yticks(range(len(rows)), labels)
         chart.set_ylim(len(rows) - 0.4, -0.6)
         chart.tick_params(axis="y", length=0)

@@ -31,6 +31,7 @@ from sasgeo_bench.boards.text import (
     Contents,
     control_lines,
     map_lines,
+    sandbox_lines,
     sealed_lines,
     seed_lines,
     segmenter_lines,
@@ -174,6 +175,7 @@ def _index(site: Site) -> dict[str, object]:
         "warnings": [
             *(f"With a metric of another package: {one.name} ({one.code})." for one in about.metrics),
             *map_lines(about),
+            *sandbox_lines(about),
             *warnings_of(source.board.leaderboard),
         ],
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,

@@ -37,6 +37,7 @@ from sasgeo_bench.boards.tables import DAGGER, MEANINGS, NOTE, RANKS_NOTE, TERMS
 from sasgeo_bench.core.errors import counted, named
 from sasgeo_bench.core.texts import markdown, markdown_item, tex
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
+from sasgeo_bench.running.sandbox import is_unguarded
 from sasgeo_bench.scoring.compare import Finding
 from sasgeo_bench.scoring.controls import ALPHA, Falsifier, Verdict
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
@@ -109,6 +110,20 @@ def map_lines(about: BoardManifest) -> list[str]:
         f"ways missing); maps of data version {OLD_STYLE_DATA_VERSION} and later have them right."
     )
     return [line]
+
+
+def sandbox_lines(about: BoardManifest) -> list[str]:
+    """Return which matchers answered outside the sandbox; empty if all answered within, or do not say where.
+
+    >>> trusted = BoardEntry(name="mine", isolation={"truth": "trusted code, not shut in"})
+    >>> sandbox_lines(BoardManifest(scorer_version=6, entries=[trusted], tasks=[]))
+    ['Without the sandbox (--trusted), so that nothing kept the truths from it: mine.']
+    """
+    names = [entry.name for entry in about.entries if is_unguarded(entry.isolation or {})]
+    if not names:
+        return []
+    whom = "it" if len(names) == 1 else "them"
+    return [f"Without the sandbox (--trusted), so that nothing kept the truths from {whom}: {', '.join(names)}."]
 
 
 def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
@@ -326,6 +341,7 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
         *seed_lines(about),
         *sealed_lines(about.sealed),
         *map_lines(about),
+        *sandbox_lines(about),
         *warnings_of(of.leaderboard),
         *training_lines(about),
         *segmenter_lines(about),

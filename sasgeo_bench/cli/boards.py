@@ -21,6 +21,7 @@ from sasgeo_bench.boards.text import (
     control_lines,
     map_lines,
     metric_lines,
+    sandbox_lines,
     segmenter_lines,
     table_text,
     tables_of,
@@ -240,6 +241,7 @@ class LeaderboardOptions(Options):
     require: Require = None
     private: Private = None
     results: Results = None
+    trusted: Annotated[bool, typer.Option("--trusted", help="run without the sandbox; the board states it")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")] = (
         False
     )
@@ -263,7 +265,12 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         sealed=sealed_seed(options.sealed_seed_file),
     )
     plan = replace(
-        plan, jobs=options.jobs, dask=options.dask, within=options.within or (), require=options.require or ()
+        plan,
+        jobs=options.jobs,
+        dask=options.dask,
+        within=options.within or (),
+        require=options.require or (),
+        is_sandboxed=not options.trusted,
     )
     if opened is not None:
         if plan.seal is None or plan.seal.seed is None:
@@ -347,5 +354,7 @@ def show_board(board: Board) -> None:
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
     turned = own_lines(board.scores)
-    for line in (*turned, *map_lines(board.about), *warnings_of(board.leaderboard), *metric_lines(board.about)):
+    about = board.about
+    warnings = (*map_lines(about), *sandbox_lines(about), *warnings_of(board.leaderboard), *metric_lines(about))
+    for line in (*turned, *warnings):
         tell(line)

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The packages in docs/examples: what a stranger enters, whole and small, and their cards fit a submission."""
+
+import math
+import sys
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sasgeo_bench as sgb
+from sasgeo_bench.core.config import parse_toml
+from sasgeo_bench.matching.submission import Card
+from tests.slow import rest_slow
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "docs" / "examples"
+MATCHERS = {"patch-neighbour": "PatchNeighbour", "plain-template": "PlainTemplate"}
+
+
+@pytest.fixture
+def load(monkeypatch):
+    def of(name):
+        module = name.replace("-", "_")
+        monkeypatch.syspath_prepend(str(EXAMPLES / name / "src"))
+        try:
+            return getattr(import_module(f"{module}.matcher"), MATCHERS[name])
+        finally:
+            for one in (module, f"{module}.matcher"):
+                sys.modules.pop(one, None)
+
+    return of
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("**/card.toml")), ids=lambda path: path.parent.name)
+def test_each_card_is_that_of_a_submission_under_the_name_of_its_folder(path):
+    card = parse_toml(path.read_text(encoding="utf-8"), Card, source=str(path))
+    assert card.name == path.relative_to(EXAMPLES).parts[0]
+    assert card.licence == "Apache-2.0"
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_a_view_without_errors_whose_heading_is_known_is_found(tiny, load, name):
+    matcher = load(name)()
+    matcher.prepare(tiny.region, None)
+    found = []
+    for query, truth in zip(tiny.queries, tiny.truths, strict=True):
+        if query.prior_group == "r500-known-s15" and truth.pose is not None:
+            best = matcher.match(query, top_k=3).poses[0]
+            found.append(math.dist(*((one.easting_m, one.northing_m) for one in (best, truth.pose))) <= 25)
+    assert any(found)  # the place is small and made up; chance is 1 in 400
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_it_withholds_where_nothing_is_known(tiny, load, name):
+    matcher = load(name)()
+    matcher.prepare(tiny.region, None)
+    query = next(query for query in tiny.queries if query.track == "localization")
+    evidence = replace(query.evidence, cells=np.full_like(query.evidence.cells, sgb.UNKNOWN))
+    blind = replace(query, evidence=evidence)
+    assert matcher.match(blind, top_k=3) == sgb.WITHHELD
+
+
+@pytest.mark.usefixtures("in_threads")
+@pytest.mark.parametrize("name", rest_slow(MATCHERS, but=0))
+def test_it_conforms(tiny, monkeypatch, name):
+    monkeypatch.syspath_prepend(str(EXAMPLES / name / "src"))
+    checks = sgb.check_matcher(f"{name.replace('-', '_')}.matcher:{MATCHERS[name]}", place=tiny)
+    assert [check.name for check in checks if check.outcome == "fail"] == []

@@ -5,10 +5,11 @@
     .venv/bin/python -m benchmarks.unsolved docs/results/modules    # of others
     .venv/bin/python -m benchmarks.unsolved --write                 # and store them: the page, and headroom.json
 
-A suite that several boards asked is shown from the one with the most places, then queries. Of entries that are ranked
-the best figure counts, whichever segmenter made the views but the one that is given the truth. Where places are absent
-there is a second figure, `right_at_absent_0.05`, of the best matcher with the best rejector; those that accept more
-than 5 % of the absent places, as their interval shows, are left out.
+A suite that several boards asked is shown from the one with the most places, then queries, and from one that can be
+entered before any other if it has six places. Of entries that are ranked the best figure counts, whichever segmenter
+made the views but the one that is given the truth. Where places are absent there is a second figure,
+`right_at_absent_0.05`, of the best matcher with the best rejector; those that accept more than 5 % of the absent places,
+as their interval shows, are left out.
 
 A figure is open where its interval (95 %) stays below the ceiling; `saturated` where it does not and less than NEAR is
 left; else, and of fewer than six places or ten queries, too few.
@@ -29,6 +30,7 @@ from sasgeo_bench.boards.tables import Record, interval_text, number_text, prior
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.core.plugins import ORACLE_SEGMENTER
 from sasgeo_bench.core.texts import markdown, markdown_code
+from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.scoring.compare import LEAST_PLACES
 from sasgeo_bench.scoring.metrics import CEILING, primary_of
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
@@ -37,7 +39,7 @@ from sasgeo_bench.tasks.query import BY, SEQUENCE
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
 ROOT = Path(__file__).parents[1]
-BOARDS = ("modules", "systems", "flights", "pictures", "aerial", "aerial-soft")  # in docs/results
+BOARDS = ("modules", "systems", "systems-objects", "flights", "pictures", "aerial", "aerial-soft")  # in docs/results
 PAGE = ROOT / "docs" / "unsolved.md"
 STORED = ROOT / "sasgeo_bench" / "boards" / FILE
 BEGIN, END = "<!-- made by benchmarks/unsolved.py -->\n", "<!-- end -->\n"
@@ -57,9 +59,9 @@ COLUMNS = ("suite", "what it asks", "figure", "to beat [95 %]", "queries (places
 
 def rows_of(folder: Path) -> Iterator[Headroom]:
     """Yield the figures of every ranked entry of a board: the first of each suite, and what its rejectors keep."""
-    entries = read_board_manifest(folder).entries
+    about = read_board_manifest(folder)
     board = read_leaderboard(folder)
-    book = Book.of(board, entries)
+    book, source = Book.of(board, about.entries), (folder.name, about.data_version or DATA_VERSION)
     judged: dict[tuple[str, ...], Record] = {}
     for row in records_of(board[(board["stratum"] == AS_DRAWN) & board["metric"].isin((REJECTION, REACHED))]):
         judged[row["suite"], row["track"], row["prior_group"], row["matcher"], row["rejector"], row["metric"]] = row
@@ -71,17 +73,17 @@ def rows_of(folder: Path) -> Iterator[Headroom]:
             found = book.main(key, name, metric)
             # Where every stressed place is absent, the figure of all queries would be of what is not stressed
             if found is not None and (found["stratum"] == STRESS or book.pick(key, name, "answered_absent") is None):
-                yield from _row(folder.name, key, name, found, book.pick(key, name, CEILING.name, found["stratum"]))
+                yield from _row(source, key, name, found, book.pick(key, name, CEILING.name, found["stratum"]))
             for (*where, rejector, one), kept in judged.items():
                 if tuple(where) == (*key, name) and one == REJECTION:
                     reached = judged.get((*key, name, rejector, REACHED))
                     if reached is not None and float(reached["lo"]) <= MOST_ACCEPTED:
                         ceiling = book.pick(key, name, CEILING.name)
-                        yield from _row(folder.name, key, f"{name} with {rejector}", kept, ceiling)
+                        yield from _row(source, key, f"{name} with {rejector}", kept, ceiling)
 
 
 def _row(
-    board: str, key: tuple[str, str, str], matcher: str, row: Record, ceiling: Record | None
+    source: tuple[str, int], key: tuple[str, str, str], matcher: str, row: Record, ceiling: Record | None
 ) -> Iterator[Headroom]:
     suite, _, perceived = key[0].partition(BY)
     most = 1.0 if ceiling is None else float(ceiling["value"])
@@ -93,7 +95,8 @@ def _row(
             prior_group=key[2],
             perceived=perceived,
             metric=str(row["metric"]),
-            board=board,
+            board=source[0],
+            data_version=source[1],
             matcher=matcher,
             value=value,
             lo=lo,
@@ -125,18 +128,23 @@ def _state(value: float, hi: float, ceiling: float, *, n: int, places: int) -> S
 def best_of(rows: Iterable[Headroom]) -> list[Headroom]:
     """Return the best row of each suite, track, prior group and figure, in the order in which they are listed.
 
-    The boards that asked it at the most places, then with the most queries, count.
+    The boards that asked it at the most places, then with the most queries, count; see `_weight`.
     """
     listed: dict[tuple[str, ...], list[Headroom]] = {}
     for row in rows:
         listed.setdefault((row.suite, row.track, row.prior_group, row.metric), []).append(row)
     best = []
     for found in listed.values():
-        places, n = max((row.places, row.n) for row in found)
-        boards = {row.board for row in found if (row.places, row.n) == (places, n)}
-        counted = [row for row in found if row.board in boards and row.places == places]
+        most = max(map(_weight, found))
+        boards = {row.board for row in found if _weight(row) == most}
+        counted = [row for row in found if row.board in boards and row.places == most[1]]
         best.append(min(counted, key=lambda row: (-row.value, -row.n, row.matcher)))
     return sorted(best, key=lambda row: (*row.order, row.prior_group, row.metric))
+
+
+def _weight(row: Headroom) -> tuple[bool, int, int]:
+    """Return what a board counts for: whether it can be entered and is no trifle, its places and its queries."""
+    return row.data_version == DATA_VERSION and row.places >= LEAST_PLACES, row.places, row.n
 
 
 def lines(rows: Sequence[Headroom]) -> Iterator[str]:
@@ -146,8 +154,9 @@ def lines(rows: Sequence[Headroom]) -> Iterator[str]:
         shown = list(found)
         yield from (_line(_cells(row)) for row in shown)
         yield ""
-        if state != SATURATED:
-            yield from ("```bash", *_commands(shown), "```", "")
+        commands = list(_commands(shown))
+        if state != SATURATED and commands:
+            yield from ("```bash", *commands, "```", "")
     never = [name for name in EVERY_SUITE if name != "controls" and not any(row.suite == name for row in rows)]
     if never:
         names = ", ".join(map(markdown_code, never))
@@ -173,12 +182,13 @@ def _cells(row: Headroom) -> Iterator[str]:
     matcher, _, rejector = row.matcher.partition(" with ")
     by = f", views by {markdown_code(row.perceived)}" if row.perceived else ""
     own = markdown_code(matcher) + (f" with {markdown_code(rejector)}" if rejector else "")
-    yield f"{own}{by} on [{row.board}](results/{row.board}/leaderboard.md)"
+    closed = "" if row.data_version == DATA_VERSION else ", closed"
+    yield f"{own}{by} on [{row.board}](results/{row.board}/leaderboard.md){closed}"
 
 
 def _commands(rows: Sequence[Headroom]) -> Iterator[str]:
-    """Yield a command for each board, with the suites that are open there."""
-    for board in dict.fromkeys(row.board for row in rows):
+    """Yield a command for each board that can be entered, with the suites that are shown from there."""
+    for board in dict.fromkeys(row.board for row in rows if row.data_version == DATA_VERSION):
         mine = [row for row in rows if row.board == board]
         plugin = "my-tracker" if {row.track for row in mine} == {SEQUENCE} else "my-matcher"
         seed = Path("docs", "results", f"{board}-sealed-seed.txt")

@@ -22,7 +22,7 @@ class Headroom(Document):
     `perceived` names the segmenter of views that were pictures, "" for others. `matcher` holds the figure, with its
     rejector where the figure is about accepted answers. `state` is "open" where the interval of the figure stays below
     the ceiling, "saturated" where it does not and the figure is near, and "too few" where so few places or queries say
-    neither.
+    neither. `data_version` is that of the board's maps: a version of the program that makes others cannot enter it.
     """
 
     suite: str
@@ -31,6 +31,7 @@ class Headroom(Document):
     perceived: str
     metric: str
     board: str
+    data_version: int
     matcher: str
     value: float
     lo: float

@@ -5,6 +5,7 @@ import pytest
 
 from benchmarks import unsolved
 from sasgeo_bench.boards.headroom import Headroom, headroom_of, read_headroom
+from sasgeo_bench.regions.region import DATA_VERSION
 
 RESULTS = unsolved.ROOT / "docs" / "results"
 
@@ -13,7 +14,7 @@ def row(**changes):
     plain = {
         "suite": "clean", "track": "localization", "prior_group": "r500-weak-s3", "perceived": "", "n": 30, "places": 9,
         "metric": "success_25m", "board": "a", "matcher": "m", "value": 0.5, "lo": 0.4, "hi": 0.6, "ceiling": 1.0,
-        "state": "open",
+        "state": "open", "data_version": DATA_VERSION,
     }  # fmt: skip
     return Headroom(**plain | changes)
 
@@ -42,6 +43,16 @@ def test_the_board_of_the_most_places_counts_and_there_the_best_of_any_segmenter
         row(value=0.99, hi=1.0, board="fewer queries", n=29),
     ]
     assert [one.matcher for one in unsolved.best_of(rows)] == ["better"]
+
+
+def test_a_board_that_can_be_entered_counts_before_others_and_they_have_no_command():
+    rows = [row(places=30, board="closed", data_version=DATA_VERSION - 1), row(value=0.45)]
+    assert [one.board for one in unsolved.best_of(rows)] == ["a"]
+    few = unsolved.best_of([rows[0], row(places=5, state="too few")])
+    assert [one.board for one in few] == ["closed"]
+    text = "\n".join(unsolved.lines(few))
+    assert "on [closed](results/closed/leaderboard.md), closed |" in text
+    assert "sasgeo-bench enter" not in text
 
 
 def test_what_is_open_comes_first_the_most_headroom_first():

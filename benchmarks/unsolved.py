@@ -8,8 +8,8 @@
 A suite that several boards asked is shown from the one with the most places, then queries, and from one that can be
 entered before any other if it has six places. Of entries that are ranked the best figure counts, whichever segmenter
 made the views but the one that is given the truth. Where places are absent there is a second figure,
-`right_at_absent_0.05`, of the best matcher with the best rejector; those that accept more than 5 % of the absent places,
-as their interval shows, are left out.
+`right_at_absent_0.05`, of the best matcher with the best rejector; those that accept more than 5 % of the absent
+places, as their interval shows, are left out.
 
 A figure is open where its interval (95 %) stays below the ceiling; `saturated` where it does not and less than NEAR is
 left; else, and of fewer than six places or ten queries, too few.

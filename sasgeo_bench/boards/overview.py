@@ -214,9 +214,11 @@ def _standing(book: Book, key: Key) -> str:
     """Return who shares the first rank, and who is behind."""
     ranked = _ranked(book, key)
     if not ranked:
-        names = [name for name in book.matchers[key] if name not in book.controls]
-        places = counted(_size(book, key)[1], "place")
-        return f"nobody is ranked: {places}, {LEAST_PLACES} are needed" if names else "asked of controls alone"
+        if book.controls.issuperset(book.matchers[key]):
+            return "asked of controls alone"
+        _, places = _size(book, key)
+        why = f": {counted(places, 'place')}, {LEAST_PLACES} are needed" if places < LEAST_PLACES else ""
+        return f"nobody is ranked{why}"
     values = {str(row["matcher"]): number_text(row["value"]) for row in ranked}
     first = [str(row["matcher"]) for row in ranked if int(row["rank_best"]) == 1]
     behind = [name for name in values if name not in first]

@@ -58,12 +58,17 @@ def said(*rows, **changes):
         # Ranks of pairs need not be transitive: nobody else may be first, yet a third is not shown to be worse.
         ({"a": (0.7, (1, 2)), "b": (0.6, (2, 2))}, "clean: a (0.700) alone may be first; b is behind."),
         ({"a": (0.7, (1, 1))}, "clean: a (0.700) is ranked without a rival."),
-        ({"a": (0.7, None), "b": (0.6, None)}, "clean: nobody is ranked: 12 places, 6 are needed."),
+        ({"a": (0.7, None), "b": (0.6, None)}, "clean: nobody is ranked."),
         ({"random": (0.1, None)}, "clean: asked of controls alone."),
     ],
 )
 def test_a_sentence_says_who_shares_the_first_rank_and_who_is_behind(rows, line):
     assert said(*(row(name, value, ranks) for name, (value, ranks) in rows.items())) == [line]
+
+
+def test_where_nobody_is_ranked_the_number_of_places_says_why():
+    lines = said(row("a", 0.7, places=4), row("b", 0.6, places=4))
+    assert lines == ["clean: nobody is ranked: 4 places, 6 are needed."]
 
 
 def test_controls_have_no_place_in_a_sentence_however_high_they_are():

@@ -214,7 +214,7 @@ def test_a_manifest_without_added_entries_is_as_before_and_names_them_where_ther
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    shares = {**SHARES, HOSTILE: 0.7}
+    shares = {**SHARES, HOSTILE: 0.5}
     return full_board(tmp_path_factory.mktemp("first") / "mine", shares=shares, added=[HOSTILE])
 
 

@@ -489,35 +489,40 @@ def _left_out(rows: pd.DataFrame) -> str:
     return f" Not known or without bounds: {'; '.join(lacking)}." if lacking else ""
 
 
-def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Figure:
+def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str], *, is_short: bool = False) -> Figure:
     """Draw success against the median latency from `price_frame`: a panel for each prior group, controls in grey.
 
-    Those of `shown` have a look each, the others are grey points. Return the figure, written where there is a path.
+    Those of `shown` have a look each, the others are grey points. A figure that `is_short` is as wide as a telephone,
+    and leaves the note and the controls to the page around it. Return the figure, written where there is a path.
     """
     rows = rows[np.isfinite(rows["latency_s"].to_numpy(float))]
     is_free = rows["matcher"].map(is_unranked).to_numpy(bool)
     names, groups = those_there(rows[~is_free], shown), sorted(set(rows["prior_group"]))
-    controls = _control_keys(sorted(set(rows.loc[is_free, "matcher"])))
+    controls = [] if is_short else _control_keys(sorted(set(rows.loc[is_free, "matcher"])))
     down, across = panels_across(len(groups))
     about = BoardPage(
-        title=f"Success against latency: {rows['suites'].iloc[0]}, {rows['track'].iloc[0]}",
-        note=(
+        title="" if is_short else f"Success against latency: {rows['suites'].iloc[0]}, {rows['track'].iloc[0]}",
+        note=""
+        if is_short
+        else (
             "The queries that the first figure of the suite counts. Upright bars: 95 % intervals; level "
             "bars: from the median latency to the 95th percentile, all suites of the track, as measured where each "
             "matcher ran. Grey line: the front, where no other matcher is both faster and better. Controls "
             "do not compete."
         ),
-        below="latency of an answer (s), median to 95th percentile",
+        below="latency of an answer (s)" if is_short else "latency of an answer (s), median to 95th percentile",
         rows=down,
         columns=across,
-        keys=[*line_keys(names), *controls],
-        panel_inches=(3.4, 2.6),
+        keys=[*(_marks(names) if is_short else line_keys(names)), *controls],
+        panel_inches=(3.0, 1.1) if is_short else (3.4, 2.6),
+        is_narrow=is_short,
     )
     with page(path, about) as charts:
         for number, chart in panels(charts, len(groups)):
             is_here = (rows["prior_group"] == groups[number]).to_numpy(bool)
             mine, free = rows[is_here & ~is_free], rows[is_here & is_free]
-            panel_title(chart, prior_words(groups[number]), rows[is_here].iloc[0])
+            if not is_short:
+                panel_title(chart, prior_words(groups[number]), rows[is_here].iloc[0])
             if len(mine):
                 _prices(chart, mine, [name for name in names if (mine["matcher"] == name).any()], "latency_s")
             _controls(chart, free, controls)
@@ -525,8 +530,18 @@ def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -
             dress_share(chart)
             chart.grid(visible=True, color=FAINT, lw=0.6)
             chart.tick_params(labelleft=number % across == 0)
-        charts[0][0].set_ylabel(PRIMARY[primary_of(str(rows["track"].iloc[0])).name])
+        what = PRIMARY[primary_of(str(rows["track"].iloc[0])).name]
+        charts[0][0].set_ylabel(what.partition(" (")[0] if is_short else what)
     return figure_of(charts[0][0])
+
+
+def _marks(names: Sequence[str]) -> list[Line2D]:
+    """Return a legend of points."""
+    looks = map(look_of, range(len(names)))
+    return [
+        Line2D([], [], color=look.colour, marker=look.mark, ms=6, ls="", label=name)
+        for look, name in zip(looks, names, strict=True)
+    ]
 
 
 def _control_keys(names: Sequence[str]) -> list[Line2D]:

@@ -31,7 +31,7 @@ from sasgeo_bench.core.texts import plain, plain_lines
 
 GREY: Final = "#555555"
 DPI: Final = 110
-_LEAST_WIDTH: Final = 6.4  # inches: notes are read in few lines
+_NARROW_LEGEND: Final = {"handlelength": 1.0, "fontsize": 7.0, "columnspacing": 1.0, "labelspacing": 0.2}
 _EDGE_INCHES: Final = 0.12  # left of title and notes
 _LETTERS: Final = 130.0  # on an inch, of a font of one point
 _TAGS: Final = re.compile(r"<[^>]+>")  # texts between them hold no bracket, and are not touched
@@ -109,7 +109,8 @@ class Page:
 
     `title` and a line of `facts` stand above the panels, `note` and whose `data` it is below; `below` names the
     axes across, once. All are broken into lines. `keys` are the handles of the legend above the panels. `rows` and
-    `columns` count panels down and across; `panel_inches` are width and height of each. `dpi` is for PNG.
+    `columns` count panels down and across; `panel_inches` are width and height of each. A page that `is_narrow` is as
+    wide as a telephone. `dpi` is for PNG.
     """
 
     title: str
@@ -120,8 +121,14 @@ class Page:
     rows: int = 1
     columns: int = 1
     panel_inches: tuple[float, float] = (2.4, 2.1)
+    is_narrow: bool = False
     keys: Sequence[Artist] = field(default=())
     dpi: int = DPI
+
+    @property
+    def least_inches(self) -> float:
+        """Return the least width: notes are to be read in few lines."""
+        return 3.7 if self.is_narrow else 6.4
 
 
 class PlainFigure(Figure):
@@ -176,19 +183,16 @@ class PlainFigure(Figure):
         if about.below:
             self._words[body.supxlabel(about.below, fontsize=mpl.rcParams["font.size"])] = about.below
         if about.keys:
-            width = paper or max(_LEAST_WIDTH, about.columns * about.panel_inches[0])
+            width = paper or max(about.least_inches, about.columns * about.panel_inches[0])
             # Number of legend entries in a row
             names = [str(key.get_label()) for key in about.keys]
-            mark, letter = (0.4, 0.052) if paper else (0.6, 0.075)  # inches that an entry takes
+            mark, letter, look = 0.6, 0.075, {"handlelength": 2.6}  # inches that an entry takes
+            if paper:
+                mark, letter, look = 0.4, 0.052, {"handlelength": 2.6, "columnspacing": 1.0}
+            elif about.is_narrow:
+                mark, letter, look = 0.25, 0.06, _NARROW_LEGEND
             across = max(1, min(len(names), int(width / (mark + letter * max(map(len, names))))))
-            inner.legend(
-                handles=about.keys,
-                loc="outside upper left",
-                ncols=across,
-                frameon=False,
-                handlelength=2.6,
-                columnspacing=1.0 if paper else None,
-            )
+            inner.legend(handles=about.keys, loc="outside upper left", ncols=across, frameon=False, **look)
         return inner
 
     def fit(self, first: Axes, last: Axes, about: Page) -> None:
@@ -201,7 +205,7 @@ class PlainFigure(Figure):
         width, height = self.get_size_inches()
         width += about.columns * (about.panel_inches[0] - box.width / self.dpi)
         height += about.rows * (about.panel_inches[1] - box.height / self.dpi)
-        self.set_size_inches(_paper_inches.get() or max(width, _LEAST_WIDTH), height)
+        self.set_size_inches(_paper_inches.get() or max(width, about.least_inches), height)
         self.arrange()
         if _paper_inches.get():  # of another height axes may have other ticks, whose labels are wider
             self.arrange()

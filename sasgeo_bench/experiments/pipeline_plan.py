@@ -216,8 +216,8 @@ class PipelinePlan:
     With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
     cluster to run on instead. `seal` tells of sealed places, `experiment` draws trials of its own, each None without
     any. `only` are the hashes of the queries to ask, all without it; those whose answer was written before the stamp
-    `since_ns` are asked again. `within` and `require` are limits and requirements of the board, as of `ScoreRequest`.
-    Without `is_sandboxed`, matchers are trusted code.
+    `since_ns` are asked again. `within` and `require` are limits and requirements of the board, as of `ScoreRequest`,
+    and `added` the matchers of `spec` that its file does not name. Without `is_sandboxed`, matchers are trusted code.
     """
 
     spec: PipelineFile
@@ -234,6 +234,7 @@ class PipelinePlan:
     within: Sequence[str] = ()
     require: Sequence[str] = ()
     is_sandboxed: bool = True
+    added: Sequence[str] = ()
 
     @property
     def split(self) -> Split | None:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, cast
 
 import numpy as np
 import pyproj
@@ -308,7 +308,7 @@ def crs_of_wkt(path: Path, wkt: str) -> pyproj.CRS | None:
     except CRSError as error:
         raise PoseError(f"{path.name} states a CRS that is not known: export it in one with an EPSG code") from error
     while crs.is_compound or crs.is_bound:
-        crs = crs.sub_crs_list[0] if crs.is_compound else crs.source_crs
+        crs = crs.sub_crs_list[0] if crs.is_compound else cast("pyproj.CRS", crs.source_crs)
     return crs
 
 
@@ -320,9 +320,9 @@ def epsg_of_wkt(path: Path, wkt: str) -> int | None:
 
 def epsg_of_crs(path: Path, crs: pyproj.CRS) -> int:
     """Return the EPSG code of a CRS; raise `PoseError` if it has none, or its datum is open."""
-    datum, ellipsoid = crs.datum, crs.ellipsoid
+    datum, size_m = crs.datum, math.nan if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre
     # pyproj takes any datum of the ellipsoid, a hundred metres off; those of this size are WGS 84 within metres.
-    is_open = datum is not None and _OPEN_DATUM.search(datum.name) and ellipsoid.semi_major_metre != 6_378_137.0
+    is_open = datum is not None and _OPEN_DATUM.search(datum.name) and size_m != 6_378_137.0
     # to_2d changes axes that WKT leaves open, and the code is then no longer found
     epsg = None if is_open else crs.to_epsg(min_confidence=70) or crs.to_2d().to_epsg(min_confidence=70)
     if epsg is None:

@@ -120,7 +120,7 @@ def draw(path):
         charts[0][0].plot([0, 1], [1, 0])
 
 
-def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=None):
+def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=None, added=()):
     """A board with all there can be but pictures; `changes` are of entries, by name, `tested` had the control."""
     scored = {name: asked_everything(share) for name, share in shares.items()}
     facts = {"track": "localization", "n": 160, "answered": 160, "missing": 0, "blocks": 40, "places": 20}
@@ -163,6 +163,7 @@ def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=Non
             {name: getattr(item, name) for name in ("name", "first", "second", "suites", "kinds", "metric", "track")}
             for item in known
         ],
+        added=list(added),
     )
 
 

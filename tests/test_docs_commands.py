@@ -93,9 +93,11 @@ OTHERS = {
     r"^python -m benchmarks\.cross_check_osm ": "needs extracts; tests/osm/test_cross_check.py reads small maps",
     r"^bash findings/NAME\.sh": "needs the package registry, and a name",
     r"^python -m benchmarks\.related_work docs/results/": "tests/boards/test_results.py prints the same table",
+    r"^python -m benchmarks\.unsolved ": "writes into docs/; tests/boards/test_unsolved.py compares what it writes",
     r"^(git show b92bad11|\S*python docs/ageing/measure\.py )": "needs extracts; tests/ageing/ holds what it writes",
     r"umask.*secrets\.token_hex": "makes a secret; tests/tasks/test_private_seed.py reads one",
-    r"^pip install 'sasgeo-bench\[(logs|publish)\]'$": "an installation needs the package registry",
+    r"^pip install ('sasgeo-bench\[(logs|publish)\]'|\. \./baselines)$": "an installation needs the package registry",
+    r"^hf upload ": "needs an account; tests/exchange/test_release.py reads the command",
 }
 PLUGIN = """[sasgeo_bench.matchers]
 my-matcher = my_matcher.matcher:MyMatcher

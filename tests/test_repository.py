@@ -33,6 +33,7 @@ WEIGHTS = "baselines/sasgeo_baselines/segmenters/osm_unet*.onnx"
 
 # Distributions whose module has another name.
 IMPORTED_AS = {
+    "huggingface-hub": "huggingface_hub",
     "lazy-loader": "lazy_loader",
     "pillow": "PIL",
     "opencv-python-headless": "cv2",
@@ -195,7 +196,28 @@ def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: 
     assert [name for name in names if name.startswith(("tests/", "baselines/", "paper/", "regions/"))] == []
 
 
+def test_every_extra_is_documented_with_its_packages() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| .* \| (.*) \|$", read("docs/howto/install.md"), flags=re.MULTILINE)
+    shown = {name: set(packages.split(", ")) for name, packages in rows}
+    extras = project()["optional-dependencies"]
+    assert shown.keys() == extras.keys()
+    assert {name: requirement_names(extras[name]) for name in shown if name != "dev"} == {
+        name: packages for name, packages in shown.items() if name != "dev"
+    }
+
+
 # Commands
+
+
+def test_ci_builds_the_image_runs_its_commands_and_knows_every_system() -> None:
+    jobs = yaml.safe_load(read(".github/workflows/checks.yml"))["jobs"]
+    ran = [step["run"] for step in jobs["container"]["steps"] if "run" in step]
+    for text in (read("Containerfile"), read("docs/howto/install.md")):
+        assert re.findall(r"^(?:#   )?(podman .*)$", text, flags=re.MULTILINE)[:3] == ran
+    assert [system.split("-")[0] for system in jobs["elsewhere"]["strategy"]["matrix"]["system"]] == [
+        "macos",
+        "windows",
+    ]
 
 
 def test_make_alone_prints_every_target_with_its_line() -> None:

@@ -38,7 +38,7 @@ from sasgeo_bench.osm.locate import Extract, TownEntry
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES
-from sasgeo_bench.regions.region import Manifest, Provenance
+from sasgeo_bench.regions.region import DATA_VERSION, Manifest, Provenance
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
 from sasgeo_bench.running.prediction_files import PART_SCHEMA
 from sasgeo_bench.scoring.metric import CostMetric, MeanMetric, Metric, QuantileMetric, RejectionMetric, ThresholdMetric
@@ -398,8 +398,8 @@ def _classes() -> Iterator[str]:
 
 _ENTERING: Final = """
 What entering each takes, fewest queries first, from what is stored with it. **Begin with `systems-objects`**: the
-fewest views of real places that need no segmenter. Where nothing can be downloaded begin with `towns`, whose places are
-made up on your machine.
+fewest views of real places that need no segmenter. Where nothing can be downloaded begin with [the board of the
+demo](../howto/submission.md#practise).
 
 ```bash
 sasgeo-bench enter docs/results/systems-objects --matcher my-matcher --dry-run  # minutes on this machine
@@ -407,8 +407,9 @@ sasgeo-bench enter docs/results/systems-objects --matcher my-matcher --dry-run  
 
 *Asking* is from the quickest ranked row of the board to the slowest, at its mean time for a query; drawing the queries
 and scoring come on top. *Extracts* are those of real places, *disk* is maps and queries. *Sealed* places need the
-published seed. Queries of another task version than today's, {version}, that are drawn otherwise by now count as
-misses. [Submit answers](../howto/submission.md) says more.
+published seed. *Closed* boards were made on maps that this version makes otherwise: their figures stand, and only the
+version that made them can enter them. Queries of another task version than today's, {version}, that are drawn otherwise
+by now count as misses. [Submit answers](../howto/submission.md) says more.
 """
 
 
@@ -417,10 +418,10 @@ def _boards() -> Iterator[str]:
     yield _ENTERING.format(version=TASK_VERSION)
     head = ("Board", "About", "Queries", "Suites", "Places", "Asking", "Extracts", "Disk", "Sealed", "Task version")
     rows = [_board(pack) for pack in sorted(RESULTS.glob("*/pack.json"))]
-    yield from table(head, sorted(rows, key=lambda row: row[2]))
+    yield from table((*head, "Open"), sorted(rows, key=lambda row: row[2]))
 
 
-def _board(pack: Path) -> tuple[str, str, int, int, int, str, str, str, str, int]:
+def _board(pack: Path) -> tuple[str, str, int, int, int, str, str, str, str, int, str]:
     """Return the row of one board, from its stored tables."""
     folder = pack.parent
     about = json.loads((folder / BOARD).read_text(encoding="utf-8"))
@@ -444,6 +445,7 @@ def _board(pack: Path) -> tuple[str, str, int, int, int, str, str, str, str, int
         f"{bytes_on_disk / 1e6:.0f} MB",
         str(len(about.get("sealed", ())) or "-"),
         int(about["task_version"]),
+        "yes" if about["data_version"] == DATA_VERSION else "closed",
     )
 
 

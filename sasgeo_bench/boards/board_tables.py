@@ -12,14 +12,15 @@ import pandas as pd
 
 from sasgeo_bench.boards.manifests import BoardEntry, MetricRecord, SeedFigure
 from sasgeo_bench.boards.tables import (
+    ADDED,
     FEW,
+    UNSTRESSED,
     Cell,
     Column,
     Field,
     Key,
     Mark,
     Record,
-    Row,
     Shown,
     Table,
     Tie,
@@ -29,7 +30,6 @@ from sasgeo_bench.boards.tables import (
     grid_of,
     interval_text,
     marks_of,
-    number_cell,
     number_text,
     p_cell,
     page_names,
@@ -111,7 +111,7 @@ class Book:
     `controls` are the entries that are never ranked, `metrics` those of other packages by name, `own` those of limits
     that were stated. `counted` names the
     kinds and steps of stress that the first figure of a table counts, `lost` the entries without a sound answer, and
-    how often; both are empty without scored queries.
+    how often; both are empty without scored queries. `added` are entries that the pipeline does not name.
     """
 
     figures: Mapping[tuple[str, ...], Record]
@@ -125,6 +125,7 @@ class Book:
     lost: Mapping[Key, str]
     metrics: Mapping[str, MetricRecord] = field(default_factory=dict)
     own: Mapping[str, MeanMetric] = field(default_factory=dict)
+    added: frozenset[str] = frozenset()
 
     @classmethod
     def of(
@@ -136,6 +137,7 @@ class Book:
         metrics: Sequence[MetricRecord] = (),
         within: Sequence[str] = (),
         require: Sequence[str] = (),
+        added: Sequence[str] = (),
     ) -> Self:
         """Index a leaderboard with its entries, which may be listed, scored queries, metrics of others and limits.
 
@@ -170,6 +172,7 @@ class Book:
             lost={key: ", ".join(_lost(rows)) for key, rows in _by_group(scored)},
             metrics={one.name: one for one in metrics},
             own=stated_metrics(within, parse_requirements(require)),
+            added=frozenset(added),
         )
 
     def pick(self, key: Key, matcher: str, metric: str, stratum: str = ALL) -> Record | None:
@@ -203,6 +206,7 @@ class Book:
         """Return the name of a matcher with its marks and a link to its page."""
         entry = self.entries.get(matcher)
         marks = marks_of(entry or BoardEntry(name=matcher), is_control=matcher in self.controls)
+        marks += (ADDED,) if matcher in self.added else ()
         return Cell(text=matcher, href=self.matcher_pages.get(matcher, ""), marks=marks)
 
     def short_name(self, matcher: str) -> Cell:
@@ -337,7 +341,7 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
         (column(primary, order="descending"), lambda row: figure_cell(row, has_bar=True)),
         (column("rank"), lambda row: rank_cell(row, ranked=ranked, mark=shares if row["matcher"] in tie_of else None)),
         *((book.column(metric), _figure(metric)) for metric in beside),
-        (column("control"), _control),
+        (column("control", title=UNSTRESSED), _control),
         (column("false fixes"), _figure(FALSE_ABSENT.name, ALL)),
         (column("detectable"), lambda row: float(row["detectable"])),
         (column("n"), lambda row: int(row["n"])),
@@ -524,136 +528,9 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
         )
 
 
-AT_MOST: Final = "at most"  # the line of the ceiling
-
-
-def summary(book: Book) -> Iterator[Table]:
-    """Yield who is good at what: a matcher a line, a suite a column, figure and rank.
-
-    Columns of false fixes at absent places follow those of the suites. The first lines say of each suite how many
-    queries count, what can be reached and what guessing and the controls reach. Suites with more ranked matchers come
-    first, so do matchers that were asked about more of them. A cell leads where its rank may be the first of several.
-    """
-    for group in sorted({key[1:] for key in book.matchers}):
-        yield _overview(book, [key for key in book.matchers if key[1:] == group])
-
-
-def _overview(book: Book, keys: Sequence[Key]) -> Table:
-    track, prior_group = keys[0][1:]
-    primary = primary_of(track).name
-    names = sorted({name for key in keys for name in book.matchers[key]})
-    by_suite = {key: {name: book.main(key, name, primary) for name in names} for key in keys}
-    ranked = {key: sum(map(_is_ranked, rows.values())) for key, rows in by_suite.items()}
-    shown = sorted((key for key in keys if any(by_suite[key].values())), key=lambda key: (-ranked[key], key))
-    absent = [key for key in shown if any(book.pick(key, name, FALSE_ABSENT.name) for name in names)]
-    found = {name: [by_suite[key][name] for key in shown] for name in names}
-    means = {name: _mean_value(rows) for name, rows in found.items()}
-    order = sorted(  # controls, then matchers: who was asked about more suites first, then who is better on them
-        (name for name, rows in found.items() if any(row is not None for row in rows)),
-        key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
-    )
-    limits = [(key, name) for key in shown for name in book.asked(track)]
-    whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
-    weighed = [at for at, key in enumerate(shown) if ranked[key]]  # the others have too few places
-    has_mean = len(weighed) > 1 and len(whole - book.controls) > 1
-    rows = _overview_heads(book, shown, absent, primary, empty=len(limits) + has_mean)
-    for name in order:
-        cells = [short_cell(by_suite[key][name], is_rivalled=ranked[key] > 1) for key in shown]
-        cells += [short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False) for key in absent]
-        cells += [short_cell(book.main(key, name, limit), has_rank=False) for key, limit in limits]
-        if has_mean:
-            cells.append(number_cell(_mean_value([found[name][at] for at in weighed]) if name in whole else math.nan))
-        tone = "head" if name in book.controls else "plain"
-        rows.append(Row(cells=(book.short_name(name), *cells), tone=tone))
-    columns = (
-        *(_suite_column(book, key, primary, has_absent=key in absent) for key in shown),
-        *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
-        *(
-            replace(book.column(limit), name=limit if len(shown) == 1 else f"{key[0]}: {limit}")
-            for key, limit in limits
-        ),
-        *([column("mean")] if has_mean else []),
-    )
-    return Table(
-        name=file_stem("summary", track, prior_group),
-        title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-        columns=(word("matcher"), *columns),
-        rows=tuple(rows),
-        notes=tuple(_overview_notes(primary, rows, has_absent=bool(absent), has_several=len(shown) > 1)),
-    )
-
-
-def _suite_column(book: Book, key: Key, primary: str, *, has_absent: bool) -> Column:
-    """Return the column of a suite, which says what is done in it, and what its figure pools: places on the map."""
-    counted = book.counted.get(key)
-    texts = (suite_words(key[0]), f"Counted, each query alike: {counted}" if counted else "")
-    meaning = " ".join(filter(None, texts)).removesuffix(".")
-    plain = column(primary, title=f"{key[0]}: on the map" if has_absent else key[0])
-    return replace(plain, meaning=meaning or plain.meaning)
-
-
-def _overview_notes(primary: str, rows: Sequence[Row], *, has_absent: bool, has_several: bool) -> Iterator[str]:
-    """Yield what the figures and the lines above the matchers are."""
-    yield f"{primary}: {column(primary).meaning}. Higher is better."
-    if has_several:
-        yield (
-            "Columns do not compare with each other: each pools all stresses of its suite, weak and strong ones, of "
-            "its own places."
-        )
-    if has_absent:
-        yield (
-            f"false fixes: {column('false fixes').meaning}. The figure of the suite itself is of its places that are "
-            "on the map."
-        )
-    if any(row.cells[0].text == AT_MOST for row in rows):
-        yield (
-            f"{AT_MOST}: what can be expected of a matcher that sees the view alone, as 1 in k where k places are the "
-            "same. An oracle gets the answer and passes it."
-        )
-
-
-def _is_ranked(row: Record | None) -> bool:
+def is_ranked(row: Record | None) -> bool:
+    """Return whether a figure has a rank: of an entry that competes, at enough places."""
     return row is not None and not is_unranked(str(row["matcher"])) and not pd.isna(row["rank_best"])
-
-
-def _mean_value(rows: Sequence[Record | None]) -> float:
-    values = [float(row["value"]) for row in rows if row is not None and not math.isnan(row["value"])]
-    return sum(values) / len(values) if values else -1.0
-
-
-def _overview_heads(book: Book, keys: Sequence[Key], absent: Sequence[Key], primary: str, *, empty: int) -> list[Row]:
-    """Return lines above the matchers: how many queries count, and a ceiling below 1 and chance where there is one.
-
-    Their last `empty` columns say nothing.
-    """
-    what = "queries"
-    if keys and keys[0][1] == SEQUENCE:
-        what = "flights under stress" if any(STRESS in book.strata[key] for key in keys) else "flights"
-    lines = {what: [plain_cell(_count(book, key, primary)) for key in keys]}
-    beside = {what: [plain_cell(_count(book, key, FALSE_ABSENT.name)) for key in absent]}
-    for title, metric in ((AT_MOST, CEILING.name), ("chance", CHANCE.name)):
-        rows = [next(filter(None, (book.main(key, name, metric) for name in book.matchers[key])), None) for key in keys]
-        lines[title] = [number_cell(_value_of(row)) for row in rows]
-    nothing = [Cell(text="-")]
-    return [
-        Row(
-            cells=(Cell(text=title), *cells, *beside.get(title, nothing * len(absent)), *nothing * empty),
-            tone="head",
-        )
-        for title, cells in lines.items()
-        if any(cell.text not in ("-", "1.000") for cell in cells)
-    ]
-
-
-def _figure(book: Book, key: Key, matcher: str, metric: str) -> Record | None:
-    """Return a figure: false fixes are of all absent places, whichever stress made them so."""
-    return book.pick(key, matcher, metric) if metric == FALSE_ABSENT.name else book.main(key, matcher, metric)
-
-
-def _count(book: Book, key: Key, metric: str) -> int:
-    """Return how many queries count: a matcher that does not answer the track has a row of all, stressed or not."""
-    rows = [row for name in book.matchers[key] if (row := _figure(book, key, name, metric)) is not None]
-    return max(int(row["n"]) for row in [row for row in rows if row["is_applicable"]] or rows)
 
 
 def short_cell(row: Record | None, *, is_rivalled: bool = False, has_rank: bool = True) -> Cell:
@@ -665,7 +542,7 @@ def short_cell(row: Record | None, *, is_rivalled: bool = False, has_rank: bool 
         return Cell(text="-")
     if not row["is_applicable"]:
         return Cell(text="n/a")
-    value, leads = float(row["value"]), is_rivalled and _is_ranked(row) and int(row["rank_best"]) == 1
+    value, leads = float(row["value"]), is_rivalled and is_ranked(row) and int(row["rank_best"]) == 1
     ends = [] if math.isnan(row["lo"]) else [f"[{row['lo']:.2f}, {row['hi']:.2f}]"]
     details = (*ends, *([f"({rank_text(row)})"] if has_rank else []))
     return Cell(text=number_text(value), key=sort_key(value), tone="leading" if leads else "plain", details=details)

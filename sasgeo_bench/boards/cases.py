@@ -300,7 +300,7 @@ def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch.write_bytes(_encoded(PNG, pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9]))
-        scratch.rename(path)
+        scratch.replace(path)
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except OSError as error:

@@ -31,7 +31,17 @@ from sasgeo_bench.boards.plots import (
     those_there,
     ticks_across,
 )
-from sasgeo_bench.core.canvas import Page, new_figure, page, panels, styled, without_ticks
+from sasgeo_bench.core.canvas import (
+    Page,
+    figure_of,
+    new_figure,
+    on_paper,
+    page,
+    panels,
+    paper_inches,
+    styled,
+    without_ticks,
+)
 from sasgeo_bench.core.errors import ConfigError, StoreError, check_given, counted
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.flights.trajectory import Trajectory
@@ -69,7 +79,7 @@ def shown_flight(scores: Mapping[str, pd.DataFrame], suite: str, regions: Sequen
     return str(region), str(flight)
 
 
-def plot_flight(flown: Trajectory, region: Region) -> Figure:
+def plot_flight(flown: Trajectory, region: Region, *, width_mm: float | None = None) -> Figure:
     """Draw a flight over the map around it, and its height and speed over time.
 
     Parameters
@@ -78,6 +88,8 @@ def plot_flight(flown: Trajectory, region: Region) -> Figure:
         In the region's CRS, as of `read_flight`.
     region : Region
         The map below it.
+    width_mm : float, optional
+        Width on paper, as 85 for a column; by default as a page has it.
 
     Returns
     -------
@@ -120,9 +132,14 @@ def plot_flight(flown: Trajectory, region: Region) -> Figure:
     )
     time_s = flown.time_s - flown.time_s[0]
     speed_mps = np.hypot(*np.diff(place_m, axis=0).T) / np.diff(flown.time_s)
-    with styled():
-        figure = new_figure((1.7 * _ONE_INCHES, _ONE_INCHES + 1.2))
-        charts = figure.framed(about).subplot_mosaic([["map", "height"], ["map", "speed"]], width_ratios=(3, 2))
+    with on_paper(width_mm), styled():
+        wide = paper_inches()
+        figure = new_figure((wide, 1.7 * wide) if wide else (1.7 * _ONE_INCHES, _ONE_INCHES + 1.2))
+        frame = figure.framed(about)
+        if wide:
+            charts = frame.subplot_mosaic([["map"], ["height"], ["speed"]], height_ratios=(4, 1, 1))
+        else:
+            charts = frame.subplot_mosaic([["map", "height"], ["map", "speed"]], width_ratios=(3, 2))
         chart = charts["map"]
         width_m, height_m = part.east_m - part.west_m, part.north_m - part.south_m
         chart.imshow(part.colours, extent=(0, width_m, 0, height_m), interpolation="antialiased", alpha=0.75)
@@ -346,7 +363,7 @@ def draw_distance(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         chart.tick_params(labelbottom=True)
 
 
-def draw_intervals(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
+def draw_intervals(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Figure:
     """Draw how far the odometer carries a fix from `interval_frame`."""
     names, kinds = those_there(rows, shown), list(dict.fromkeys(rows["kind"]))
     note = (
@@ -367,6 +384,7 @@ def draw_intervals(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None
         for at, name in enumerate(names):
             line = mine[mine["matcher"] == name].sort_values("every_m")
             draw_line(chart, line, dodged(line["every_m"].to_numpy(float), at, len(names), by=0.03), at)
+    return figure_of(chart)
 
 
 def draw_drift(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:

@@ -233,7 +233,7 @@ class BoardManifest(Record):
     """
 
     without_empty: ClassVar = frozenset(
-        {"title", "private_seed", "private", "sealed", "metrics", "within", "require", "elsewhere", "failed"}
+        {"title", "private_seed", "private", "sealed", "metrics", "within", "require", "added", "elsewhere", "failed"}
     )
 
     scorer_version: int
@@ -258,6 +258,7 @@ class BoardManifest(Record):
     metrics: list[MetricRecord] = []
     within: list[str] = []  # limits and requirements, as they were stated
     require: list[str] = []
+    added: list[str] = []  # entries that the pipeline does not name
     remarks: list[str] = []
     elsewhere: list[Elsewhere] = []
     failed: dict[str, str] = {}

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sasgeo_bench.boards.tables import prior_words
-from sasgeo_bench.core.canvas import GREY, Page, broken, figure_of, page, panels
+from sasgeo_bench.core.canvas import GREY, Page, broken, figure_of, most_across, page, panels
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.base import Floats, Ints, codes_of
@@ -311,7 +311,7 @@ def panels_across(count: int) -> tuple[int, int]:
     >>> panels_across(3), panels_across(9)
     ((1, 3), (3, 4))
     """
-    columns = max(1, min(ACROSS, count))
+    columns = max(1, min(most_across(ACROSS), count))
     return -(-count // columns), columns
 
 
@@ -353,7 +353,7 @@ def panel_title(chart: Axes, name: str, row: Mapping[str, Any] | pd.Series) -> N
     chart.set_title(f"{name}\nn {row['n']:g}, {counted(int(row['blocks']), 'block')}")
 
 
-def each_panel(path: Path, names: Sequence[str], about: Page, label: str = "") -> Iterator[tuple[Axes, str]]:
+def each_panel(path: Path | None, names: Sequence[str], about: Page, label: str = "") -> Iterator[tuple[Axes, str]]:
     """Yield a panel for each name, with a `label` if it stands at the edge; the page is written when all are drawn."""
     down, across = panels_across(len(names))
     with page(path, replace(about, rows=down, columns=across)) as charts:
@@ -409,27 +409,27 @@ _DODGE: Final = 0.011  # of an axis, between two matchers at one step
 # --- success by what was done -----------------------------------------------------------------------------------------
 
 
-def draw_steps(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
+def draw_steps(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Figure:
     """Draw success against strength, from `steps_frame`: panels of kinds and view sizes, lines of matchers."""
     first = rows.iloc[0]
     note = f"Strength 0: the controls, the same places with nothing done to the view. {INTERVALS}"
     title = f"Success against strength: {of_which(first)}"
-    _draw_lines(path, rows, shown, title, note, ("strength", str(first["strength_unit"])))
+    return _draw_lines(path, rows, shown, title, note, ("strength", str(first["strength_unit"])))
 
 
-def draw_ages(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
+def draw_ages(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Figure:
     """Draw success against the age of the map from `ages_frame`, in panels and lines as in `draw_steps`."""
     note = (
         "A point stands at the mean age of the maps of its step; the grey line at the bottom shows from which to "
         f"which age they are. {INTERVALS}"
     )
     title = f"Success against the age of the map: {of_which(rows.iloc[0])}"
-    _draw_lines(path, rows, shown, title, note, ("age_years", "age of the map (years)"))
+    return _draw_lines(path, rows, shown, title, note, ("age_years", "age of the map (years)"))
 
 
 def _draw_lines(
-    path: Path, rows: pd.DataFrame, shown: Sequence[str], title: str, note: str, axis: tuple[str, str]
-) -> None:
+    path: Path | None, rows: pd.DataFrame, shown: Sequence[str], title: str, note: str, axis: tuple[str, str]
+) -> Figure:
     column, label = axis
     names = those_there(rows, shown)
     kinds, sizes = (sorted(set(rows[name])) for name in ("kind", "view_cells"))
@@ -460,6 +460,7 @@ def _draw_lines(
                     draw_line(chart, line_of, line_of[column].to_numpy(float) + shift, number)
                 _write_counts(chart, mine, column)
             line[0].set_ylabel(measure)
+    return figure_of(charts[0][0])
 
 
 def _write_counts(chart: Axes, mine: pd.DataFrame, column: str) -> None:
@@ -481,8 +482,8 @@ def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     draw_bar_panels(path, rows, shown, "suite", sorted(set(rows["suite"])), title=title, note=note)
 
 
-def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequence[PlaceDifference]) -> None:
-    """Draw a contrast place by place, from `contrasts.by_place`, and pooled below."""
+def draw_forest(path: Path | None, contrast: Contrast, finding: Finding, places: Sequence[PlaceDifference]) -> Figure:
+    """Draw a contrast place by place, from `contrasts.by_place`, and pooled below; return it as `draw_risk` does."""
     is_primary = contrast.metric == "primary"
     what = PRIMARY[primary_of(contrast.track).name].replace("\n", " ") if is_primary else contrast.metric
     better = f"{'left' if finding.is_lower_better else 'right'} of 0: {contrast.first} is better"
@@ -519,6 +520,7 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
         chart.set_xlim(-1.06 * max([*ends, least]), 1.06 * max([*ends, least]))
         chart.tick_params(axis="y", length=0)
         chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
+    return figure_of(chart)
 
 
 # --- what is known of the answers -------------------------------------------------------------------------------------
@@ -533,8 +535,8 @@ def draw_risk(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Fi
     mixtures = list(dict.fromkeys(rows["mixture"]))
     there = set(zip(rows["matcher"], rows["mixture"], strict=True))
     cells = [(name, mixture) for name in names for mixture in mixtures if (name, mixture) in there]
-    is_grid = len(mixtures) > 1 and len(cells) == len(names) * len(mixtures)
-    columns = len(mixtures) if is_grid else min(ACROSS, len(cells))
+    is_grid = 1 < len(mixtures) <= most_across(len(mixtures)) and len(cells) == len(names) * len(mixtures)
+    columns = len(mixtures) if is_grid else panels_across(len(cells))[1]
     pooled = " Present 0.9: present and absent places reweighted to nine in ten present." if len(mixtures) > 1 else ""
     about = BoardPage(
         title=f"Risk against coverage: {of_which(rows.iloc[0])}",
@@ -641,12 +643,17 @@ def _reliable(chart: Axes, mine: pd.DataFrame) -> None:
 # --- protection levels ------------------------------------------------------------------------------------------------
 
 
-def draw_stanford(path: Path, levels: Mapping[tuple[str, str], ProtectionLevels], limit_m: float) -> None:
-    """Draw protection levels of one prior group and risk against errors: a panel for each matcher and method."""
+def draw_stanford(path: Path | None, levels: Mapping[tuple[str, str], ProtectionLevels], limit_m: float) -> Figure:
+    """Draw protection levels of one prior group and risk against errors: a panel for each matcher and method.
+
+    Return the figure, written where there is a path.
+    """
     names, methods = (list(dict.fromkeys(key[at] for key in levels)) for at in (0, 1))
     first = next(iter(levels.values()))
     cells = {key: stanford_cells(item) for key, item in levels.items()}
     most = max(int(frame["n"].max()) for frame in cells.values())
+    drawn = [(name, method) for name in names for method in methods]
+    columns = most_across(len(methods))
     about = BoardPage(
         title=f"Protection levels at risk {first.risk:g}: all suites, localization, {prior_words(first.prior_group)}",
         note=(
@@ -656,20 +663,20 @@ def draw_stanford(path: Path, levels: Mapping[tuple[str, str], ProtectionLevels]
             f"Darker cells hold more queries, the darkest {most}; what is beyond 1 km, or none, lies on the margin."
         ),
         below="position error (m)",
-        rows=len(names),
-        columns=len(methods),
+        rows=-(-len(drawn) // columns),
+        columns=columns,
         panel_inches=(2.25, 2.1),
     )
     with page(path, about) as charts:
-        for line, name in zip(charts, names, strict=True):
-            for chart, method in zip(line, methods, strict=True):
-                item = levels.get((name, method))
-                chart.set_title(f"{name}, {method}\n{_available(item, limit_m)}")
-                _stanford_axes(chart, limit_m)
-                if item is not None:
-                    _stanford(chart, item, cells[name, method], limit_m, most)
-                chart.tick_params(labelleft=chart is line[0], labelbottom=line is charts[-1])
-            line[0].set_ylabel("protection level (m)")
+        for number, chart in panels(charts, len(drawn)):
+            key = drawn[number]
+            item = levels.get(key)
+            chart.set_title(f"{', '.join(key)}\n{_available(item, limit_m)}")
+            _stanford_axes(chart, limit_m)
+            if item is not None:
+                _stanford(chart, item, cells[key], limit_m, most)
+            label_outer(chart, number, columns, len(drawn), "protection level (m)")
+    return figure_of(charts[0][0])
 
 
 def _available(item: ProtectionLevels | None, limit_m: float) -> str:

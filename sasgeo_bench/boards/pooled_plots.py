@@ -37,7 +37,7 @@ from sasgeo_bench.boards.plots import (
     ticks_across,
 )
 from sasgeo_bench.boards.tables import prior_words
-from sasgeo_bench.core.canvas import figure_of, page, panels
+from sasgeo_bench.core.canvas import broken, figure_of, page, panels, paper_inches
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
@@ -61,6 +61,7 @@ MOST_ERROR_M: Final = 2000.0
 _RADII_M: Final = np.unique(np.concatenate((np.geomspace(LEAST_ERROR_M, MOST_ERROR_M, 87), [5.0, 10.0, FIX_M])))
 _RATIOS: Final = np.unique(np.concatenate((np.geomspace(1.0, 200.0, 47), COST_RATIOS)))
 _NO_INTERVAL: Final = (np.nan, np.nan)
+_NAMES_OF_PAPER, _PAPER_POINTS = 0.42, 7.0  # share of a column that names may take, and their size
 
 
 class _Panel(NamedTuple):
@@ -488,35 +489,40 @@ def _left_out(rows: pd.DataFrame) -> str:
     return f" Not known or without bounds: {'; '.join(lacking)}." if lacking else ""
 
 
-def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Figure:
+def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str], *, is_short: bool = False) -> Figure:
     """Draw success against the median latency from `price_frame`: a panel for each prior group, controls in grey.
 
-    Those of `shown` have a look each, the others are grey points. Return the figure, written where there is a path.
+    Those of `shown` have a look each, the others are grey points. A figure that `is_short` is as wide as a telephone,
+    and leaves the note and the controls to the page around it. Return the figure, written where there is a path.
     """
     rows = rows[np.isfinite(rows["latency_s"].to_numpy(float))]
     is_free = rows["matcher"].map(is_unranked).to_numpy(bool)
     names, groups = those_there(rows[~is_free], shown), sorted(set(rows["prior_group"]))
-    controls = _control_keys(sorted(set(rows.loc[is_free, "matcher"])))
+    controls = [] if is_short else _control_keys(sorted(set(rows.loc[is_free, "matcher"])))
     down, across = panels_across(len(groups))
     about = BoardPage(
-        title=f"Success against latency: {rows['suites'].iloc[0]}, {rows['track'].iloc[0]}",
-        note=(
+        title="" if is_short else f"Success against latency: {rows['suites'].iloc[0]}, {rows['track'].iloc[0]}",
+        note=""
+        if is_short
+        else (
             "The queries that the first figure of the suite counts. Upright bars: 95 % intervals; level "
             "bars: from the median latency to the 95th percentile, all suites of the track, as measured where each "
             "matcher ran. Grey line: the front, where no other matcher is both faster and better. Controls "
             "do not compete."
         ),
-        below="latency of an answer (s), median to 95th percentile",
+        below="latency of an answer (s)" if is_short else "latency of an answer (s), median to 95th percentile",
         rows=down,
         columns=across,
-        keys=[*line_keys(names), *controls],
-        panel_inches=(3.4, 2.6),
+        keys=[*(_marks(names) if is_short else line_keys(names)), *controls],
+        panel_inches=(3.0, 1.1) if is_short else (3.4, 2.6),
+        is_narrow=is_short,
     )
     with page(path, about) as charts:
         for number, chart in panels(charts, len(groups)):
             is_here = (rows["prior_group"] == groups[number]).to_numpy(bool)
             mine, free = rows[is_here & ~is_free], rows[is_here & is_free]
-            panel_title(chart, prior_words(groups[number]), rows[is_here].iloc[0])
+            if not is_short:
+                panel_title(chart, prior_words(groups[number]), rows[is_here].iloc[0])
             if len(mine):
                 _prices(chart, mine, [name for name in names if (mine["matcher"] == name).any()], "latency_s")
             _controls(chart, free, controls)
@@ -524,8 +530,18 @@ def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -
             dress_share(chart)
             chart.grid(visible=True, color=FAINT, lw=0.6)
             chart.tick_params(labelleft=number % across == 0)
-        charts[0][0].set_ylabel(PRIMARY[primary_of(str(rows["track"].iloc[0])).name])
+        what = PRIMARY[primary_of(str(rows["track"].iloc[0])).name]
+        charts[0][0].set_ylabel(what.partition(" (")[0] if is_short else what)
     return figure_of(charts[0][0])
+
+
+def _marks(names: Sequence[str]) -> list[Line2D]:
+    """Return a legend of points."""
+    looks = map(look_of, range(len(names)))
+    return [
+        Line2D([], [], color=look.colour, marker=look.mark, ms=6, ls="", label=name)
+        for look, name in zip(looks, names, strict=True)
+    ]
 
 
 def _control_keys(names: Sequence[str]) -> list[Line2D]:
@@ -549,6 +565,11 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
     Return the figure, written where there is a path.
     """
     rows = contrasts[contrasts["n"] > 0].to_dict("records")
+    labels = [f"{row['name']}: {row['first']} - {row['second']}" for row in rows]
+    wide = _NAMES_OF_PAPER * paper_inches()
+    if wide:  # the pair stands below the name
+        labels = [broken(label.replace(": ", ":\n", 1), wide, _PAPER_POINTS) for label in labels]
+    lines = max((label.count("\n") + 1 for label in labels), default=1)
     about = BoardPage(
         title="Registered contrasts",
         note=(
@@ -557,7 +578,7 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
             "differences smaller than was registered to matter; an interval within it rules out those that do."
         ),
         below="difference (shares; of other metrics in their unit)",
-        panel_inches=(4.6, 0.4 + 0.28 * len(rows)),
+        panel_inches=(4.6, 0.4 + max(0.28, 0.15 * lines) * len(rows)),
     )
     with page(path, about) as charts:
         chart = charts[0][0]
@@ -567,7 +588,6 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
             chart.hlines(at, row["lo"], row["hi"], color=colour, lw=1.6)
             chart.plot(row["difference"], at, marker="s", color=colour, ms=4.5, ls="")
         chart.axvline(0.0, color="#000000", lw=0.8)
-        labels = [f"{row['name']}: {row['first']} - {row['second']}" for row in rows]
         chart.set_yticks(range(len(rows)), labels)
         chart.set_ylim(len(rows) - 0.4, -0.6)
         chart.tick_params(axis="y", length=0)

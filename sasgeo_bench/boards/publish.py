@@ -22,8 +22,11 @@ from sasgeo_bench.boards.board_files import (
     csv_text,
     read_leaderboard,
 )
+from sasgeo_bench.boards.board_tables import Book
 from sasgeo_bench.boards.manifests import PipelineRecord
+from sasgeo_bench.boards.overview import overviews_of, times_frame
 from sasgeo_bench.boards.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
+from sasgeo_bench.boards.pooled_plots import draw_tradeoff
 from sasgeo_bench.boards.private_board import check_public
 from sasgeo_bench.boards.site import site_pages
 from sasgeo_bench.boards.site_files import (
@@ -57,6 +60,8 @@ from sasgeo_bench.tasks.split import find_split_file, read_split_file
 
 _MAP: Final = "places.svg"
 _RATES: Final = "ageing-rates.svg"
+_TIMES: Final = "first-times.svg"
+MOST_TIMES: Final = 5  # matchers with a look of their own on the first page
 _OF_SCENES: Final = (
     *(*GROUP, "kind_of_place", "matcher", "metric", "n", "blocks", "places"),
     *("value", "lo", "hi", "lo_blocks", "hi_blocks", "interval", "rank_best", "rank_worst"),
@@ -93,7 +98,7 @@ def publish(board: Path, into: Path | None = None, *, root: Path = Path("out"), 
                 target,
                 files,
                 pages=pages,
-                figures=filter(None, (*source.figures, source.rates_figure, source.map_figure)),
+                figures=filter(None, (*source.figures, source.rates_figure, source.map_figure, source.times_figure)),
                 name=source.name,
             )
     if written.site_bytes > MOST_BYTES:
@@ -143,17 +148,22 @@ def _source(files: BoardFiles, root: Path) -> SiteSource:
     if lost:
         tell(f"not on the map of places, for no region of that name ships or is built in {root}: {', '.join(lost)}")
     places = places_on_map(about.tasks, spots, parts)
-    book = load_ratebook()
-    drawing: dict[str, Callable[[Path], None]] = {_RATES: partial(draw_rates, book=book)}
+    rates = load_ratebook()
+    drawing: dict[str, Callable[[Path], object]] = {_RATES: partial(draw_rates, book=rates)}
     if places:
         drawing[_MAP] = partial(draw_places, places=places)
+    book = Book.of(files.board.leaderboard, about.entries, added=about.added)
+    times = next(map(times_frame, overviews_of(book)), pd.DataFrame())
+    if len(times):
+        first = dict.fromkeys((*times["matcher"][:MOST_TIMES], *sorted(book.added.intersection(times["matcher"]))))
+        drawing[_TIMES] = partial(draw_tradeoff, rows=times, shown=tuple(first), is_short=True)
     with scratch_folder("figures") as folder:
         drawn = {file: SiteFigure.of(file, draw_text(draw, folder)) for file, draw in drawing.items()}
     return SiteSource(
         name=name,
         title=_title_of(files.board, about.title or (name if spec is None else spec.title)),
         board=files.board,
-        rates=book,
+        rates=rates,
         registered=_registered(files, spec),
         reasons={} if spec is None else {item.name: " ".join(item.why.split()) for item in spec.contrast},
         figures=files.figures,
@@ -163,6 +173,7 @@ def _source(files: BoardFiles, root: Path) -> SiteSource:
         parts=parts,
         rates_figure=drawn[_RATES],
         map_figure=drawn.get(_MAP),
+        times_figure=drawn.get(_TIMES),
     )
 
 

@@ -381,6 +381,7 @@ def _manifest_of(
         metrics=metrics,
         within=list(request.within),
         require=list(request.require),
+        added=sorted(request.added),
         remarks=list(remarks),
         elsewhere=list(request.elsewhere),
         failed=dict(failed),

@@ -39,9 +39,10 @@ class ScoreRequest:
     their maps. `jobs` processes fit rejectors, or workers of the cluster at `dask`.
 
     `pipeline` is name and hash of the pipeline that requests the board, if one does, `title` its title. `private` is a
-    board of a private seed of the same pipeline to compare rows with. `kept` is the manifest of stored results: it
-    keeps the version of their maps, their title and their sealed places, and their results on a private seed where no
-    private board is named. `sealed` are the sealed places (`private_seed.sealed_record`). `failed` names entries that
+    board of a private seed of the same pipeline to compare rows with. `added` are entries that the pipeline does not
+    name. `kept` is the manifest of stored results: it keeps the version of their maps, their title and their sealed
+    places, and their results on a private seed where no private board is named.
+    `sealed` are the sealed places (`private_seed.sealed_record`). `failed` names entries that
     failed before scoring, and why. `stored` is a board whose entries are not fitted again, `elsewhere` rows of other
     boards that asked the same queries. What rejectors make of the answers is kept for the next time in the folder
     `kept_fits`, if there is one (`archive.fits_folder`).
@@ -63,6 +64,7 @@ class ScoreRequest:
     by_block: Collection[str] = ()
     pipeline: PipelineRecord | None = None
     title: str = ""
+    added: Collection[str] = ()
     without: Collection[str] = ()
     submissions: Sequence[Path] = ()
     jobs: int = 1

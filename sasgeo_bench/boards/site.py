@@ -15,10 +15,11 @@ from jinja2 import Environment, PackageLoader
 from sasgeo_bench.boards.board_tables import Book, sections_of
 from sasgeo_bench.boards.elsewhere import elsewhere_tables
 from sasgeo_bench.boards.manifests import FailedCase
+from sasgeo_bench.boards.overview import FEW_RULE, overviews_of
 from sasgeo_bench.boards.site_files import SiteFigure, SiteSource
 from sasgeo_bench.boards.site_maps import OUTCOMES, PlaceMap, place_maps, rate_table, region_table
+from sasgeo_bench.boards.site_pages import OUTCOMES as CONTRAST_OUTCOMES
 from sasgeo_bench.boards.site_pages import (
-    BETTER,
     MatcherPage,
     SuitePage,
     contrasts_of,
@@ -31,6 +32,7 @@ from sasgeo_bench.boards.text import (
     Contents,
     control_lines,
     map_lines,
+    sandbox_lines,
     sealed_lines,
     seed_lines,
     segmenter_lines,
@@ -103,6 +105,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         metrics=board.about.metrics,
         within=board.about.within,
         require=board.about.require,
+        added=board.about.added,
         requirements=board.requirements,
     )
     site = Site(
@@ -144,27 +147,21 @@ def _index(site: Site) -> dict[str, object]:
     """Return what the first page shows."""
     source, book, about, controls = site.source, site.book, site.source.board.about, site.source.board.verdicts
     sections, contrasts = sections_of(book), contrasts_of(source)
-    tables = site.tables["index.html"]
-    overview = tuple(table for table in tables["summary"] if sum(row.tone != "control" for row in table.rows) > 1)
-    prices = {table.name.replace("summary", "price", 1) for table in overview}
-    counts = Counter(item.outcome for item in contrasts)
-    outcomes = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
-    shown = "; ".join(f"{item.headline} ({item.name})" for item in contrasts if item.outcome in BETTER)
-    found = (
-        f"Of {counted(len(contrasts), 'difference')} registered before anything was run: {outcomes}. "
-        f"{f'Shown: {shown}.' if shown else 'Nobody is shown to be better than another.'}"
-    )
     failed = [item for item in controls if not item.holds]  # the board, or rows of some entries alone
     is_board = any(item.is_of_board for item in failed)
+    found = Counter(item.outcome for item in contrasts)
+    counts = {outcome: found[outcome] for outcome in CONTRAST_OUTCOMES}
     return {
         "sections": sections,
         "elsewhere": elsewhere_tables(about.elsewhere),
         "words_of": {item.prior_group: item.prior for item in sections},
-        "overview": overview,
-        "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),
+        "overviews": overviews_of(book),
+        "few_rule": FEW_RULE,
+        "leaderboard": source.board.leaderboard,
         "ranks_note": RANKS_NOTE,
         "contrasts": contrasts,
-        "found": found,
+        "outcomes": {outcome: count for outcome, count in counts.items() if count},
+        "outcome_meanings": CONTRAST_OUTCOMES,
         "made_of": _made_of(book),
         "control_lines": control_lines(controls),
         "controls_state": "failed" if is_board else "held" if controls and not failed else "doubtful",
@@ -174,6 +171,7 @@ def _index(site: Site) -> dict[str, object]:
         "warnings": [
             *(f"With a metric of another package: {one.name} ({one.code})." for one in about.metrics),
             *map_lines(about),
+            *sandbox_lines(about),
             *warnings_of(source.board.leaderboard),
         ],
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,

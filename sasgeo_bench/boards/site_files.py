@@ -98,7 +98,7 @@ class SiteSource:
     `title` is that of the board's pipeline where it is known. `reasons` states why
     each contrast was registered. `spots` are positions of regions, as far as they are known; `parts` holds place, and
     half or part of the split, of each region; `rates` is measured ageing. `scenes` is success by kind of place
-    (`tables.scene_frame`).
+    (`tables.scene_frame`). `times_figure` is of the first page: accuracy against time.
     """
 
     name: str
@@ -115,6 +115,7 @@ class SiteSource:
     parts: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     rates_figure: SiteFigure | None = None
     map_figure: SiteFigure | None = None
+    times_figure: SiteFigure | None = None
 
 
 _NAMED: Final = 5  # boards that an error lists
@@ -427,7 +428,7 @@ def _put(path: Path, data: bytes) -> None:
     path.write_bytes(data)
 
 
-def draw_text(draw: Callable[[Path], None], folder: Path) -> str:
+def draw_text(draw: Callable[[Path], object], folder: Path) -> str:
     """Return the text of an SVG that a function draws into a path in a scratch folder."""
     path = folder / "drawn.svg"
     draw(path)

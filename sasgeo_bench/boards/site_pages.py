@@ -13,11 +13,11 @@ from sasgeo_bench.boards.board_tables import SHOWN_COSTS, Book, rejection_of, st
 from sasgeo_bench.boards.manifests import BoardEntry, Picture
 from sasgeo_bench.boards.site_files import SiteFigure, SiteSource
 from sasgeo_bench.boards.tables import (
+    UNSTRESSED,
     Bar,
     Cell,
     Field,
     Key,
-    Record,
     Table,
     column,
     figure_cell,
@@ -28,14 +28,13 @@ from sasgeo_bench.boards.tables import (
     p_text,
     prior_words,
     rank_cell,
-    records_of,
     suite_card,
     table_of,
     word,
 )
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.running.prediction_files import CardRecord
-from sasgeo_bench.scoring.compare import LOWER
+from sasgeo_bench.scoring.compare import BETTER, LOWER, Finding, Outcome
 from sasgeo_bench.scoring.metrics import FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.tasks.query import base_of
@@ -57,8 +56,14 @@ def figures_by_kind(figures: Sequence[SiteFigure]) -> dict[str, list[SiteFigure]
 
 
 _OF_SHARES: Final = frozenset({"primary", "interaction", "shift"})  # metrics whose meaning is a name that all know
-BETTER: Final = frozenset({"decided", "cause open", "decided, small"})  # in which one is better
-OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided", "not tested")  # as on the page
+OUTCOMES: Final[Mapping[Outcome, str]] = {  # in the order of the page, with their meanings
+    "decided": "A difference is shown: its interval and its test, adjusted for all contrasts, leave out 0",
+    "cause open": "A difference is shown, but the first is ahead without the stress, too, which need not be the cause",
+    "decided, small": "A difference is shown, and one as large as was registered to matter is ruled out",
+    "equal": "No difference is shown, and one as large as was registered to matter is ruled out, either way",
+    "not decided": "Neither a difference is shown, nor ruled out that there is one that matters",
+    "not tested": "No query of this board counts for it",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +77,7 @@ class ContrastSummary:
     """
 
     name: str
-    outcome: str
+    outcome: Outcome
     headline: str
     because: str
     difference: str
@@ -89,70 +94,63 @@ class ContrastSummary:
 
 
 def contrasts_of(source: SiteSource) -> tuple[ContrastSummary, ...]:
-    """Return registered contrasts, decided ones first."""
-    records = records_of(source.board.contrasts)
-    ends = [abs(float(row[name])) for row in records for name in ("lo", "hi", "difference")]
+    """Return registered contrasts, decided ones first; stored words are made anew, for older boards have others."""
+    findings = source.board.findings
+    ends = [abs(end) for item in findings for end in (item.lo, item.hi, item.difference)]
     reach = max((end for end in ends if math.isfinite(end)), default=1.0) or 1.0
-    found = [_summary(row, source, reach) for row in records]
-    return tuple(sorted(found, key=lambda item: OUTCOMES.index(item.outcome)))
+    order = list(OUTCOMES)
+    return tuple(
+        sorted((_summary(item, source, reach) for item in findings), key=lambda found: order.index(found.outcome))
+    )
 
 
-def _summary(row: Record, source: SiteSource, reach: float) -> ContrastSummary:
-    verdict, name, outcome, least = str(row["verdict"]), str(row["name"]), str(row["outcome"]), float(row["least"])
-    first, second, is_first = row["first"], row["second"], float(row["difference"]) >= 0
-    headline = f"{first} against {second}"
-    if outcome in BETTER:
-        better, worse = (first, second) if verdict.startswith(f"{first} is better") else (second, first)
-        headline = f"{better} is better than {worse}" + verdict.partition(" is better")[2]
-    below, above = _ends(row)
-    figure = f"{file_stem('contrast', name)}.svg"
-    known = [float(row[end]) for end in ("lo", "hi", "difference")]
+def _summary(item: Finding, source: SiteSource, reach: float) -> ContrastSummary:
+    below, above = _ends(item)
+    figure = f"{file_stem('contrast', item.name)}.svg"
+    known = (item.lo, item.hi, item.difference)
     lo, hi, at = (round(50 + 50 * value / reach, 1) if math.isfinite(value) else math.nan for value in known)
     return ContrastSummary(
-        name=name,
-        outcome=outcome,
-        headline=headline,
-        because="" if outcome in BETTER else verdict.partition(": ")[2] or verdict,
-        difference=_difference_text(row) if int(row["n"]) else "",
-        side=f"above 0: {above} ahead" if is_first else f"below 0: {below} ahead",
+        name=item.name,
+        outcome=item.outcome,
+        headline=item.headline.removesuffix(f": {item.outcome}"),  # which stands beside it
+        because="" if item.outcome in BETTER else item.verdict.partition(": ")[2] or item.verdict,
+        difference=_difference_text(item) if item.n else "",
+        side=f"above 0: {above} ahead" if item.difference >= 0 else f"below 0: {below} ahead",
         ends=(below, above),
-        sentence=_sentence(row, least),
-        facts=tuple(_contrast_facts(row, source)),
-        unstressed=_unstressed(source.board.falsifiers, name),
-        why=source.reasons.get(name, ""),
-        figure=figure if any(item.file == figure for item in source.figures) else "",
+        sentence=_sentence(item),
+        facts=tuple(_contrast_facts(item, source)),
+        unstressed=_unstressed(source.board.falsifiers, item.name),
+        why=source.reasons.get(item.name, ""),
+        figure=figure if any(one.file == figure for one in source.figures) else "",
         bar=Bar(lo=lo, hi=hi, at=at) if all(map(math.isfinite, known)) else None,
-        least=0.0 if math.isnan(least) else min(50.0, round(50 * least / reach, 1)),
+        least=0.0 if math.isnan(item.least) else min(50.0, round(50 * item.least / reach, 1)),
         reach=reach,
     )
 
 
-def _ends(row: Record) -> tuple[str, str]:
+def _ends(item: Finding) -> tuple[str, str]:
     """Return who is better where first less second is below 0, and where it is above."""
-    first, second = str(row["first"]), str(row["second"])
-    return (first, second) if row["metric"] in LOWER else (second, first)
+    return (item.first, item.second) if item.metric in LOWER else (item.second, item.first)
 
 
-def _sentence(row: Record, least: float) -> str:
+def _sentence(item: Finding) -> str:
     """Return the difference with its interval, in words that state which direction is good."""
-    if not int(row["n"]):
+    if not item.n:
         return "No query of this board counts for it."
-    values = f"{number_text(float(row['first_value']))} against {number_text(float(row['second_value']))}"
-    below, above = _ends(row)
-    metric = str(row["metric"])
-    meaning = column(metric).meaning
-    what = f"{meaning[0].lower()}{meaning[1:]}" if metric in _OF_SHARES else f"{metric} ({meaning})"
-    good = "less is better" if metric in LOWER else "more is better"
-    most = number_text(float(row["attainable"]))
+    values = f"{number_text(item.first_value)} against {number_text(item.second_value)}"
+    below, above = _ends(item)
+    meaning = column(item.metric).meaning
+    what = f"{meaning[0].lower()}{meaning[1:]}" if item.metric in _OF_SHARES else f"{item.metric} ({meaning})"
+    good = "less is better" if item.metric in LOWER else "more is better"
     return (
-        f"Difference {_difference_text(row)} in the {what}: {values}; {good}. Above 0 {above} is ahead, below 0 "
-        f"{below}. At most {most} could be gained. The least difference registered as one that matters is "
-        f"{number_text(least)}."
+        f"Difference {_difference_text(item)} in the {what}: {values}; {good}. Above 0 {above} is ahead, below 0 "
+        f"{below}. At most {number_text(item.attainable)} could be gained. The least difference registered as one that "
+        f"matters is {number_text(item.least)}."
     )
 
 
-def _difference_text(row: Record | pd.Series) -> str:
-    return interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
+def _difference_text(item: Finding) -> str:
+    return interval_text(item.difference, item.lo, item.hi)
 
 
 def _unstressed(falsifiers: pd.DataFrame, contrast: str) -> str:
@@ -162,29 +160,28 @@ def _unstressed(falsifiers: pd.DataFrame, contrast: str) -> str:
         return ""
     row = own.iloc[0]
     gained = " What it gains there is not owed to what the contrast is named for." if row["lo"] > 0 else ""
+    difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
     return (
-        f"Without the stress, where they should not differ: {_difference_text(row)}, {row['verdict'].lower()} "
+        f"Without the stress, where they should not differ: {difference}, {row['verdict'].lower()} "
         f"(n = {row['n']}, {counted(int(row['blocks']), 'block')}).{gained}"
     )
 
 
-def _contrast_facts(row: Record, source: SiteSource) -> Iterator[str]:
-    p = float(row["p_holm"])
-    if not math.isnan(p):
-        yield f"adjusted p {p_text(p)} (Holm, {counted(len(source.board.contrasts), 'contrast')})"
-    yield f"n = {counted(int(row['n']), 'query', 'queries')}"
-    yield counted(int(row["blocks"]), "block")
-    yield counted(int(row["places"]), "place")
-    if 0 < row.get("countries", 0) < row["places"]:  # older boards do not count them
-        yield counted(int(row["countries"]), "country", "countries")
-    if row["metric"] == "primary":
-        yield f"right by the first alone {row['first_only']}, by the second alone {row['second_only']}"
-    detectable = float(row["detectable"])
-    if math.isinf(detectable):
+def _contrast_facts(item: Finding, source: SiteSource) -> Iterator[str]:
+    if not math.isnan(item.p_holm):
+        yield f"adjusted p {p_text(item.p_holm)} (Holm, {counted(len(source.board.contrasts), 'contrast')})"
+    yield f"n = {counted(item.n, 'query', 'queries')}"
+    yield counted(item.blocks, "block")
+    yield counted(item.places, "place")
+    if 0 < item.countries < item.places:  # older boards do not count them
+        yield counted(item.countries, "country", "countries")
+    if item.metric == "primary":
+        yield f"right by the first alone {item.first_only}, by the second alone {item.second_only}"
+    if math.isinf(item.detectable):
         yield "so few places cannot show any difference"
-    elif not math.isnan(detectable):
-        yield f"least difference that so many places can show {number_text(detectable)}"
-    yield from (item.queries_text() for item in source.registered if item.name == row["name"])
+    elif not math.isnan(item.detectable):
+        yield f"least difference that so many places can show {number_text(item.detectable)}"
+    yield from (one.queries_text() for one in source.registered if one.name == item.name)
 
 
 # --- suites -----------------------------------------------------------------------------------------------------------
@@ -332,7 +329,7 @@ def _results_table(book: Book, name: str, track: str, prior_group: str) -> Table
         (word("suite"), lambda key: book.suite_cell(key[0])),
         (column(primary), lambda key: figure_cell(found[key], has_bar=True)),
         (column("rank"), _rank),
-        (column("control"), lambda key: figure_cell(book.pick(key, name, primary, "control"))),
+        (column("control", title=UNSTRESSED), lambda key: figure_cell(book.pick(key, name, primary, "control"))),
         (column("false fixes"), lambda key: figure_cell(book.pick(key, name, FALSE_ABSENT.name))),
         (column("n"), lambda key: int(found[key]["n"])),
         (column("missing"), lambda key: int(found[key]["missing"])),

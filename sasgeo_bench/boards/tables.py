@@ -143,7 +143,8 @@ class Column:
 class Row:
     """A line of a table; the first cell is its head.
 
-    `tone` says how it looks: plain, control, tied, other-tie; head stays above all others, however they are sorted.
+    `tone` says how it looks: plain, control, tied, other-tie; head stays above all others, however they are sorted,
+    and foot, of controls, below them.
     """
 
     cells: tuple[Cell, ...]
@@ -381,11 +382,9 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     **_meanings("matcher"),
     "rank": "Ranks that the matcher can have, all pairs compared at once. Matchers that share a rank cannot be "
     f"distinguished. With fewer than {LEAST_PLACES} places no entry is ranked (-)",
-    "control": "The same figure at the same places without the stress",
+    "control": "The same figure at the same places without the stress (stratum control)",
     "false fixes": "Share of absent places that were answered; each such answer is a false fix. Lower is better",
     **_meanings("detectable", "n"),
-    "mean": "Mean of the suites beside it in which somebody is ranked, which weigh alike; of entries that were asked "
-    "about all suites",
     **_meanings("missing", "blocks", "suite", "part", "kind"),
     "risk kept": "Whether at most 5 % of all answers are false: yes or no where the whole interval says so, else open",
     **_meanings("rejector", "track", "contrast", "first", "second", "difference"),
@@ -473,9 +472,12 @@ MARKS: Final[dict[str, str]] = {  # words next to names and ranks
     "trained on": "the places that its parameters come from",
     "set apart": "in a table of its own and in no rank, for the reason stated there",
     FAILED_CONTROL: "it fails a control of the board, whose right score is known beforehand: do not trust the row",
+    "added": "it was asked in addition to the matchers of the pipeline",
     "tie": "shares ranks with others, who are named below the table; neighbouring ties differ in colour",
 }
-CONTROL: Final = Mark(text="control", meaning="no rival: it is a reference for reading the figures")
+CONTROL: Final = Mark(text="control", meaning="no rival: its right outcome is known beforehand")
+UNSTRESSED: Final = "unstressed"  # the stratum of controls, in words that are not those of a board's controls
+ADDED: Final = Mark(text="added", meaning=MARKS["added"], tone="added")
 FEW: Final = Mark(
     text="few",
     meaning=f"fewer than {LEAST_PLACES} places: no entry is ranked, and other places of the kind may well differ",

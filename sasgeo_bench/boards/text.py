@@ -29,14 +29,14 @@ from sasgeo_bench.boards.board_tables import (
     seed_table,
     step_tables,
     suite_tables,
-    summary,
     use_tables,
 )
 from sasgeo_bench.boards.manifests import BoardEntry, BoardManifest, MetricRecord
-from sasgeo_bench.boards.tables import DAGGER, MEANINGS, NOTE, RANKS_NOTE, TERMS, Table, text_of
+from sasgeo_bench.boards.tables import DAGGER, MEANINGS, NOTE, RANKS_NOTE, TERMS, Table, interval_text, text_of
 from sasgeo_bench.core.errors import counted, named
 from sasgeo_bench.core.texts import markdown, markdown_item, tex
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
+from sasgeo_bench.running.sandbox import is_unguarded
 from sasgeo_bench.scoring.compare import Finding
 from sasgeo_bench.scoring.controls import ALPHA, Falsifier, Verdict
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
@@ -111,6 +111,20 @@ def map_lines(about: BoardManifest) -> list[str]:
     return [line]
 
 
+def sandbox_lines(about: BoardManifest) -> list[str]:
+    """Return which matchers answered outside the sandbox; empty if all answered within, or do not say where.
+
+    >>> trusted = BoardEntry(name="mine", isolation={"truth": "trusted code, not shut in"})
+    >>> sandbox_lines(BoardManifest(scorer_version=6, entries=[trusted], tasks=[]))
+    ['Without the sandbox (--trusted), so that nothing kept the truths from it: mine.']
+    """
+    names = [entry.name for entry in about.entries if is_unguarded(entry.isolation or {})]
+    if not names:
+        return []
+    whom = "it" if len(names) == 1 else "them"
+    return [f"Without the sandbox (--trusted), so that nothing kept the truths from {whom}: {', '.join(names)}."]
+
+
 def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
     """Return whether the controls of a board held, failures one by one.
 
@@ -140,6 +154,22 @@ def _held_lines(verdicts: Sequence[Verdict]) -> list[str]:
     head = f"Controls: {len(verdicts) - len(failed)} of {len(verdicts)} held."
     more = "; if these share no code, the queries may reveal the truth" if len(rivals) > 1 else ""
     return [f"{head} Do not trust the rows of {', '.join(rivals)}{more}:", *lines]
+
+
+def contrast_lines(findings: Sequence[Finding]) -> list[str]:
+    """Return what came of each registered contrast, with its difference, or why it is open.
+
+    >>> found = Finding(name="age", first="with", second="without", metric="primary", n=90, blocks=30, places=18,
+    ...     best=1.0, second_value=0.6, difference=0.0, lo=-0.02, hi=0.02, p_holm=1.0, least=0.03)
+    >>> contrast_lines([found])
+    ['age: with and without are equal (within 0.03): difference 0.000 [-0.020, 0.020]']
+    """
+    lines = []
+    for item in findings:
+        why = item.verdict.removeprefix(f"{item.outcome}: ") if item.outcome.startswith("not ") else ""
+        difference = f"difference {interval_text(item.difference, item.lo, item.hi)}" if item.n else ""
+        lines.append(": ".join(filter(None, (item.name, item.headline, why, difference))))
+    return lines
 
 
 def seed_lines(about: BoardManifest) -> list[str]:
@@ -244,8 +274,8 @@ class Contents:
 
     `scores` are the scored queries, `steps` the steps of stress (`strata.steps_frame`), `ages` their names where they
     are ages of a map (`plots.age_names`), `scenes` success by kind of place (`tables.scene_frame`), `metrics`
-    those of other packages, `within` and `require` the limits and requirements that were stated, and `requirements`
-    what came of the latter.
+    those of other packages, `within` and `require` the limits and requirements that were stated, `requirements` what
+    came of the latter, and `added` the entries that the pipeline does not name.
     """
 
     leaderboard: pd.DataFrame
@@ -262,12 +292,13 @@ class Contents:
     metrics: Sequence[MetricRecord] = ()
     within: Sequence[str] = ()
     require: Sequence[str] = ()
+    added: Sequence[str] = ()
     requirements: pd.DataFrame = field(default_factory=pd.DataFrame)
 
     @cached_property
     def book(self) -> Book:
         """Return the figures that take every answer, by entry and queries."""
-        stated = {"within": self.within, "require": self.require}
+        stated = {"within": self.within, "require": self.require, "added": self.added}
         return Book.of(self.leaderboard, self.entries, self.scores, metrics=self.metrics, **stated)
 
 
@@ -288,14 +319,13 @@ TABLES: Final = (  # of a whole board, in the order in which any outlet shows th
         "terminal leaderboard.md leaderboard.tex index.html",
         lambda of: requirement_tables(of.requirements, of.book),
     ),
-    TableKind("summary", "terminal index.html", lambda of: summary(of.book)),
     TableKind("seeds", "leaderboard.md leaderboard.tex index.html", lambda of: [seed_table(of.entries)]),
-    TableKind("contrasts", "terminal leaderboard.md leaderboard.tex", lambda of: [contrast_table(of.findings)]),
+    TableKind("contrasts", "leaderboard.md leaderboard.tex", lambda of: [contrast_table(of.findings)]),
     TableKind("falsifiers", "leaderboard.md", lambda of: [falsifier_table(of.falsifiers)]),
     TableKind("suites", "leaderboard.md leaderboard.tex", lambda of: suite_tables(of.book)),
     TableKind("use", "leaderboard.md", lambda of: use_tables(of.book)),
     TableKind("kinds", "kinds-of-place.html", lambda of: scene_tables(of.scenes, of.book)),
-    TableKind("risk", "terminal rejection.html", lambda of: risk_tables(of.leaderboard)),
+    TableKind("risk", "rejection.html", lambda of: risk_tables(of.leaderboard)),
     TableKind("risk by suite", "rejection.html", lambda of: risk_tables_by_suite(of.leaderboard)),
     TableKind(
         "rejection", "leaderboard.md leaderboard.tex rejection.html", lambda of: rejection_tables(of.leaderboard)
@@ -326,6 +356,7 @@ def board_markdown(about: BoardManifest, of: Contents) -> str:
         *seed_lines(about),
         *sealed_lines(about.sealed),
         *map_lines(about),
+        *sandbox_lines(about),
         *warnings_of(of.leaderboard),
         *training_lines(about),
         *segmenter_lines(about),

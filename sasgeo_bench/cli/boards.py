@@ -13,17 +13,20 @@ from sasgeo_bench.boards.archive_file import is_pack
 from sasgeo_bench.boards.board import Board
 from sasgeo_bench.boards.cases import own_lines
 from sasgeo_bench.boards.manifests import SeedRecord
+from sasgeo_bench.boards.overview import overview_lines, overviews_of
 from sasgeo_bench.boards.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.boards.private_board import check_public, read_private
 from sasgeo_bench.boards.text import (
     TERMINAL,
     Contents,
+    contrast_lines,
     control_lines,
     map_lines,
     metric_lines,
+    rows_of,
+    sandbox_lines,
     segmenter_lines,
     table_text,
-    tables_of,
     warnings_of,
 )
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress
@@ -240,6 +243,7 @@ class LeaderboardOptions(Options):
     require: Require = None
     private: Private = None
     results: Results = None
+    trusted: Annotated[bool, typer.Option("--trusted", help="run without the sandbox; the board states it")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is up to date and what is left, and stop")] = (
         False
     )
@@ -254,8 +258,9 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     opened = None if options.opened is None else read_day(options.opened, flag="--opened")
     own_metrics(options.within or (), parse_requirements(options.require or ()))  # before hours of runs
     _begin(file, spec.archive, options)
+    added = [name for name in dict.fromkeys(options.matcher or ()) if name not in spec.matchers]
     plan = plan_pipeline(
-        spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(options.matcher or ()))))}),
+        spec.model_copy(update={"matchers": [*dict.fromkeys(spec.matchers), *added]}),
         out=options.out,
         extract_folders=tuple(options.extracts or ()),
         region_folders=tuple(options.region_files or ()),
@@ -263,7 +268,13 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         sealed=sealed_seed(options.sealed_seed_file),
     )
     plan = replace(
-        plan, jobs=options.jobs, dask=options.dask, within=options.within or (), require=options.require or ()
+        plan,
+        jobs=options.jobs,
+        dask=options.dask,
+        within=options.within or (),
+        require=options.require or (),
+        is_sandboxed=not options.trusted,
+        added=added,
     )
     if opened is not None:
         if plan.seal is None or plan.seal.seed is None:
@@ -330,22 +341,28 @@ def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) 
 
 
 def show_board(board: Board) -> None:
-    """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
+    """Print what a board says in short: who is good at what, and what came of the contrasts; its files say the rest."""
     shown = Contents(
         leaderboard=board.leaderboard,
         within=board.about.within,
         require=board.about.require,
-        findings=board.findings,
+        added=board.about.added,
         requirements=board.requirements,
     )
-    kinds = tables_of(shown, TERMINAL)
-    for table in (one for tables in kinds.values() for one in tables if one.rows):
+    for table in rows_of(shown, TERMINAL):
         say(table.title)
         print_table(table_text(table))
-    for line in dict.fromkeys(note for table in kinds["risk"] for note in table.notes):
+    for item in overviews_of(shown.book):
+        say(item.shown.title)
+        print_table(table_text(item.shown))
+        for line in (*overview_lines(item), *filter(None, (item.trust(board.leaderboard),))):
+            say(line)
+    for line in contrast_lines(board.findings):
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
     turned = own_lines(board.scores)
-    for line in (*turned, *map_lines(board.about), *warnings_of(board.leaderboard), *metric_lines(board.about)):
+    about = board.about
+    warnings = (*map_lines(about), *sandbox_lines(about), *warnings_of(board.leaderboard), *metric_lines(about))
+    for line in (*turned, *warnings):
         tell(line)

@@ -27,7 +27,7 @@ from sasgeo_bench.core.texts import plain, plain_lines
 
 EXIT_USER: Final = 2  # exit status
 CONTESTANT_FAILED: Final = 4
-PIPE_WIDTH: Final = 200
+PIPE_WIDTH: Final = 240
 LOG: Final = "SASGEO_LOG"  # variable with the file that lines are appended to
 _FIRST_S: Final = 3.0  # a command that is silent for longer says that it is at work
 _LATE: Final = 1.5  # times the usual pause between two lines of progress

@@ -179,14 +179,20 @@ def _list_regions(folders: Iterable[Path] | None) -> None:
 
 
 def _list_suites() -> None:
+    """Print the suites in the order of docs/unsolved.md: what is open first, most headroom first."""
+    from sasgeo_bench.boards.headroom import OPEN, headroom_of, read_headroom  # noqa: PLC0415
     from sasgeo_bench.tasks.suites.all_suites import find_suite, list_suites  # noqa: PLC0415
 
     def row(name: str) -> tuple[str, ...]:
-        suite = find_suite(name)
-        per_site = sum(len(suite.tracks(variant)) for variant in suite.variants)
-        return suite.card.title, ", ".join(suite.card.tracks), str(per_site), suite.card.separates
+        suite, best = find_suite(name), headroom_of(name)
+        per_site = str(sum(len(suite.tracks(variant)) for variant in suite.variants))
+        left = "-" if best is None else f"{best.headroom:.2f}" if best.state == OPEN else best.state
+        return suite.card.title, ", ".join(suite.card.tracks), per_site, left, suite.card.separates
 
-    _list_rows(("suite", "title", "tracks", "per site", "separates"), list_suites(), row)
+    asked = list(dict.fromkeys(one.suite for one in read_headroom()))
+    names = sorted(list_suites(), key=lambda name: asked.index(name) if name in asked else len(asked))
+    _list_rows(("suite", "title", "tracks", "per site", "headroom", "separates"), names, row)
+    tell("headroom: the most that could be gained over today's best on published boards (docs/unsolved.md)")
 
 
 def _list_metrics() -> None:

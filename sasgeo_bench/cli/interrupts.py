@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 EXIT_INTERRUPTED: Final = 128 + signal.SIGINT
-_OTHERS: Final = (signal.SIGTERM, signal.SIGHUP)  # which else end a program without a word, and leave what it began
+# Which else end a program without a word, and leave what it began; Windows has no SIGHUP
+_OTHERS: Final = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _PAUSE_S: Final = 0.01  # after which an interrupt that Python dropped comes again
 _received: list[int] = []  # of these, in this process: a KeyboardInterrupt does not state which it was
 
@@ -49,7 +50,10 @@ def interrupted_by_signals() -> Iterator[None]:
             frame = sys._current_frames().get(thread)  # noqa: SLF001 - documented
             stack = [] if frame is None else [each.f_code for each, _ in walk_stack(frame)]
             is_inside = send_again.__code__ in stack
-        os.kill(os.getpid(), number)
+        if sys.platform == "win32":  # where `os.kill` ends the process
+            signal.raise_signal(number)
+        else:
+            os.kill(os.getpid(), number)
 
     print_dropped = sys.unraisablehook
     sys.unraisablehook = send_again

@@ -104,7 +104,7 @@ class ReleaseOptions(Options):
     board: Annotated[
         Path | None,
         typer.Option(
-            help="stored results of a board, as docs/results/towns: draw its queries and release exactly these"
+            help="stored results of a board, as docs/results/systems-objects: draw and release exactly its queries"
         ),
     ] = None
     pipeline: Annotated[

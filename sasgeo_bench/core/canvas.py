@@ -11,7 +11,8 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from contextvars import ContextVar
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, cast
@@ -25,11 +26,12 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.core.texts import plain, plain_lines
 
 GREY: Final = "#555555"
 DPI: Final = 110
-_LEAST_WIDTH: Final = 6.4  # inches: notes are read in few lines
+_NARROW_LEGEND: Final = {"handlelength": 1.0, "fontsize": 7.0, "columnspacing": 1.0, "labelspacing": 0.2}
 _EDGE_INCHES: Final = 0.12  # left of title and notes
 _LETTERS: Final = 130.0  # on an inch, of a font of one point
 _TAGS: Final = re.compile(r"<[^>]+>")  # texts between them hold no bracket, and are not touched
@@ -57,6 +59,48 @@ _STYLE: Final[dict[Any, Any]] = {
     "figure.constrained_layout.wspace": 0.0,
     "figure.constrained_layout.hspace": 0.0,
 }
+# Of a figure on paper, which is printed as large as it is drawn
+_SMALL: Final[dict[Any, Any]] = {
+    "font.size": 7.0,
+    "legend.fontsize": 6.5,
+    "axes.titlesize": 7.0,
+    "axes.linewidth": 0.6,
+    "pdf.fonttype": 42,  # whole fonts: publishers refuse those of type 3
+    "figure.constrained_layout.w_pad": 0.03,
+    "figure.constrained_layout.h_pad": 0.03,
+}
+_OF_FILES: Final = ("pdf.fonttype", "svg.fonttype", "svg.hashsalt")  # are read when a figure is written
+_SMALLER: Final = 0.82  # of a figure on paper, as its letters are
+_MM: Final = 25.4  # of an inch
+_LEAST_MM, _MOST_MM = 60.0, 400.0
+_PAPER_ACROSS: Final = 2  # panels side by side on paper, at most
+_paper_inches: ContextVar[float] = ContextVar("paper_inches", default=0.0)  # the width of figures; 0 is as on a page
+
+
+@contextmanager
+def on_paper(width_mm: float | None) -> Iterator[None]:
+    """Draw pages that wide until the block ends, with small letters and panels below each other; None changes nothing.
+
+    Title, facts and note are not drawn: they are the `caption` of the figure. Raise `ConfigError` for a width that no
+    paper has.
+    """
+    if width_mm is not None and not _LEAST_MM <= width_mm <= _MOST_MM:
+        raise ConfigError(f"width_mm is from {_LEAST_MM:g} to {_MOST_MM:g}, as 85 for a column, got {width_mm!r}")
+    token = _paper_inches.set(0.0 if width_mm is None else width_mm / _MM)
+    try:
+        yield
+    finally:
+        _paper_inches.reset(token)
+
+
+def paper_inches() -> float:
+    """Return the width of figures on paper; 0 where they are drawn as on a page."""
+    return _paper_inches.get()
+
+
+def most_across(count: int) -> int:
+    """Return how many panels may stand side by side where a page has so many: fewer on paper."""
+    return min(count, _PAPER_ACROSS) if _paper_inches.get() else count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,7 +109,8 @@ class Page:
 
     `title` and a line of `facts` stand above the panels, `note` and whose `data` it is below; `below` names the
     axes across, once. All are broken into lines. `keys` are the handles of the legend above the panels. `rows` and
-    `columns` count panels down and across; `panel_inches` are width and height of each. `dpi` is for PNG.
+    `columns` count panels down and across; `panel_inches` are width and height of each. A page that `is_narrow` is as
+    wide as a telephone. `dpi` is for PNG.
     """
 
     title: str
@@ -76,8 +121,14 @@ class Page:
     rows: int = 1
     columns: int = 1
     panel_inches: tuple[float, float] = (2.4, 2.1)
+    is_narrow: bool = False
     keys: Sequence[Artist] = field(default=())
     dpi: int = DPI
+
+    @property
+    def least_inches(self) -> float:
+        """Return the least width: notes are to be read in few lines."""
+        return 3.7 if self.is_narrow else 6.4
 
 
 class PlainFigure(Figure):
@@ -91,6 +142,7 @@ class PlainFigure(Figure):
     """
 
     _words: Mapping[Text, str] = MappingProxyType({})  # as given, to be broken into lines of the figure's width
+    caption: str = ""  # what a page says around its panels, of a figure on paper
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with every text of it, ticks and legends included, as plain text."""
@@ -115,21 +167,32 @@ class PlainFigure(Figure):
         """Write the texts and the legend of a page; return the part of the figure for its panels."""
         body: Any = self.subfigures()
         inner: Any = body.subfigures()
-        foot = f"{about.note}\nData: {about.data}".lstrip()
-        self._words = {
-            self.suptitle(about.title, ha="left", fontsize=10.5, weight="bold"): about.title,
-            self.supxlabel(foot, ha="left", fontsize=7.5, color=GREY, linespacing=1.3): foot,
-        }
-        if about.facts:
+        paper = _paper_inches.get()
+        if paper:
+            self.caption = plain(" ".join(filter(None, (f"{about.title}.", about.facts, about.note))))
+            foot = f"Data: {about.data}"
+            self._words = {self.supxlabel(foot, ha="left", fontsize=5.5, color=GREY): foot}
+        else:
+            foot = f"{about.note}\nData: {about.data}".lstrip()
+            self._words = {
+                self.suptitle(about.title, ha="left", fontsize=10.5, weight="bold"): about.title,
+                self.supxlabel(foot, ha="left", fontsize=7.5, color=GREY, linespacing=1.3): foot,
+            }
+        if about.facts and not paper:
             self._words[body.suptitle(about.facts, ha="left", fontsize=8.0, color=GREY)] = about.facts
         if about.below:
-            self._words[body.supxlabel(about.below, fontsize=8.5)] = about.below
+            self._words[body.supxlabel(about.below, fontsize=mpl.rcParams["font.size"])] = about.below
         if about.keys:
-            width = max(_LEAST_WIDTH, about.columns * about.panel_inches[0])
+            width = paper or max(about.least_inches, about.columns * about.panel_inches[0])
             # Number of legend entries in a row
             names = [str(key.get_label()) for key in about.keys]
-            across = max(1, min(len(names), int(width / (0.6 + 0.075 * max(map(len, names))))))
-            inner.legend(handles=about.keys, loc="outside upper left", ncols=across, frameon=False, handlelength=2.6)
+            mark, letter, look = 0.6, 0.075, {"handlelength": 2.6}  # inches that an entry takes
+            if paper:
+                mark, letter, look = 0.4, 0.052, {"handlelength": 2.6, "columnspacing": 1.0}
+            elif about.is_narrow:
+                mark, letter, look = 0.25, 0.06, _NARROW_LEGEND
+            across = max(1, min(len(names), int(width / (mark + letter * max(map(len, names))))))
+            inner.legend(handles=about.keys, loc="outside upper left", ncols=across, frameon=False, **look)
         return inner
 
     def fit(self, first: Axes, last: Axes, about: Page) -> None:
@@ -142,8 +205,10 @@ class PlainFigure(Figure):
         width, height = self.get_size_inches()
         width += about.columns * (about.panel_inches[0] - box.width / self.dpi)
         height += about.rows * (about.panel_inches[1] - box.height / self.dpi)
-        self.set_size_inches(max(width, _LEAST_WIDTH), height)
+        self.set_size_inches(_paper_inches.get() or max(width, about.least_inches), height)
         self.arrange()
+        if _paper_inches.get():  # of another height axes may have other ticks, whose labels are wider
+            self.arrange()
         self.set_layout_engine("none")
 
     def arrange(self) -> None:
@@ -177,12 +242,13 @@ class PlainFigure(Figure):
         """Write the figure; each entry of its metadata is one line."""
         given = options.pop("metadata", None) or {}
         kept = {name: plain(value) if isinstance(value, str) else value for name, value in given.items()}
-        super().savefig(fname, metadata=kept, **options)
+        with mpl.rc_context({name: _SMALL.get(name, _STYLE.get(name)) for name in _OF_FILES}):
+            super().savefig(fname, metadata=kept, **options)
 
 
 def styled() -> AbstractContextManager[None]:
     """Apply the style of all figures until the block ends."""
-    return mpl.rc_context(_STYLE)
+    return mpl.rc_context(_STYLE | _SMALL if _paper_inches.get() else _STYLE)
 
 
 def new_figure(size_inches: tuple[float, float], *, dpi: int = DPI) -> PlainFigure:
@@ -195,14 +261,20 @@ def new_figure(size_inches: tuple[float, float], *, dpi: int = DPI) -> PlainFigu
 @contextmanager
 def page(path: Path | None, about: Page) -> Iterator[list[list[Axes]]]:
     """Yield the panels of a figure, row by row; write it as .svg or .png, if there is a path, when the block ends."""
+    paper = _paper_inches.get()
+    if paper:  # its letters are smaller, and so may its panels be
+        wide = paper / about.columns - 0.5
+        about = replace(about, panel_inches=(wide, _SMALLER * about.panel_inches[1]))
     wide, high = about.panel_inches
     with styled():
         # Larger than needed: `fit` makes it smaller, and too small a figure has no room for panels.
-        figure = new_figure((about.columns * (wide + 0.5) + 4.0, about.rows * (high + 1.0) + 6.0), dpi=about.dpi)
+        across = paper or about.columns * (wide + 0.5) + 4.0
+        figure = new_figure((across, about.rows * (high + 1.0) + 6.0), dpi=about.dpi)
         charts = figure.framed(about).subplots(about.rows, about.columns, squeeze=False)
         yield charts.tolist()
         for chart in charts.flat:
-            chart.set_title(broken(chart.get_title("left"), wide, 8.0))
+            title = chart.get_title("left").replace(" %", "\0%") if paper else chart.get_title("left")
+            chart.set_title(broken(title, wide, mpl.rcParams["axes.titlesize"]).replace("\0", " "))
         figure.fit(charts[0, 0], charts[-1, -1], about)
         if path is not None:
             figure.write(path, about)

@@ -2,11 +2,12 @@
 """Write folders whole or not at all, by one run at a time; remove them; compare their files with listed hashes."""
 
 import errno
-import fcntl
 import gc
 import hashlib
 import os
+import shutil
 import stat
+import sys
 import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -25,6 +26,9 @@ from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.core.texts import one_line
 
+if sys.platform != "win32":
+    import fcntl
+
 
 def remove_tree(folder: Path) -> None:
     """Remove a folder with all its content, whatever a plugin has made there; raise nothing, follow no link.
@@ -32,6 +36,9 @@ def remove_tree(folder: Path) -> None:
     It goes down and up again folder by folder, with one of them open at a time: depth, long names and missing rights do
     not stop it. What the system refuses to remove stays; the folder need not exist.
     """
+    if sys.platform == "win32":  # opens no folders
+        shutil.rmtree(folder, ignore_errors=True)
+        return
     with suppress(OSError):
         here = _opened(str(folder), None)
         try:
@@ -135,7 +142,7 @@ def fresh_file(path: Path, *, mend: str) -> Iterator[Path]:
         try:
             yield scratch
             _flush(scratch)
-            scratch.rename(path)
+            scratch.replace(path)
         finally:  # also of an interrupt; once it is renamed there is none
             with suppress(OSError):
                 scratch.unlink()
@@ -208,7 +215,10 @@ def _clear(path: Path) -> None:
 
 
 def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+    is_windows = sys.platform == "win32"  # which flushes no folder, and no file that cannot be written
+    if is_windows and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDWR if is_windows else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
@@ -361,7 +371,7 @@ def check_room(folder: Path) -> None:
     there = next((path for path in folder.parents if path.exists()), folder)
     if not there.is_dir():
         raise StoreError(f"{folder} cannot be written, for {there} is a file: name another folder")
-    if folder.is_mount():
+    if os.path.ismount(folder):
         raise StoreError(f"{folder} is a mount point, which cannot be replaced as a whole: name a folder in it")
     try:
         with tempfile.TemporaryDirectory(prefix=".sasgeo-bench-", dir=there):
@@ -388,6 +398,13 @@ def scratch_folder(what: str, *, within: Path | None = None) -> Iterator[Path]:
     makes its first one there. `what` is a word of the name, and `within` a folder other than the system's.
     """
     root = Path(tempfile.gettempdir() if within is None else within).resolve()
+    if sys.platform == "win32":  # locks no folder, so nothing is swept
+        folder = Path(tempfile.mkdtemp(prefix=f"{_NEW}{what}-", dir=root))
+        try:
+            yield folder
+        finally:
+            remove_tree(folder)
+        return
     _sweep_once(root)
     folder = Path(tempfile.mkdtemp(prefix=f"{_NEW}{what}-", dir=root))
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -404,7 +421,7 @@ def scratch_folder(what: str, *, within: Path | None = None) -> Iterator[Path]:
 def sweep(root: Path) -> int:
     """Remove the scratch folders of programs that were killed; return how many. Those of other users stay."""
     swept = 0
-    for folder in sorted(root.glob(f"{PREFIX}*")):
+    for folder in sorted(root.glob(f"{PREFIX}*")) if sys.platform != "win32" else ():
         with suppress(OSError):  # a link, a file, another user's, locked, or gone meanwhile
             lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             try:

@@ -52,7 +52,12 @@ from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
 from sasgeo_bench.tasks.task_files import TASK, Task, TruthManifest
 
 HIDDEN_PARTS: Final = ("test", "crossfit")  # whose truths are left out unless asked for
-_EXTRA: Final = {"mlcroissant": "mlcroissant", "pystac": "pystac", "rio_cogeo": "rio-cogeo"}
+_EXTRA: Final = {
+    "huggingface_hub": "huggingface-hub",
+    "mlcroissant": "mlcroissant",
+    "pystac": "pystac",
+    "rio_cogeo": "rio-cogeo",
+}
 _ADDRESS: Final = re.compile(r"https?://[A-Za-z0-9._~:/?#\[\]@!$&()*+,;=%-]+")  # no quotes and brackets of markup
 
 

@@ -14,7 +14,7 @@ import shapely
 
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.core.parquet import read_schema
-from sasgeo_bench.core.texts import json_text, markdown, markdown_code, quoted
+from sasgeo_bench.core.texts import json_text, markdown, markdown_code
 from sasgeo_bench.exchange.release_files import (
     COPYRIGHT_URL,
     LICENCE_URL,
@@ -501,32 +501,33 @@ _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"),
 def card_text(release: Release) -> str:
     """Return the card: Markdown after a YAML head."""
     sections = (_opening, _suites, _regions, _loading, _meaning, _ending)
-    head = "\n".join(("---", *_head(release), "---"))
+    head = f"---\n{_head(release)}\n---"
     return "\n\n".join((head, *(section(release) for section in sections))) + "\n"
 
 
-def _head(release: Release) -> Iterator[str]:
-    """Yield YAML for the Hub and for `datasets.load_dataset(folder, configuration)`."""
-    size = next((name for most, name in _SIZES if release.queries < most), "n>1M")
-    yield "license: odbl"
-    yield "pretty_name: sasgeo-bench"
-    yield f"attribution: {quoted(release.credit)}"
-    yield "tags: [geospatial, OpenStreetMap, UAV, map-localization]"
-    yield f"size_categories: [{quoted(size)}]"
-    yield "configs:"
+def _head(release: Release) -> str:
+    """Return YAML for the Hub and for `datasets.load_dataset(folder, configuration)`."""
+    from huggingface_hub import DatasetCardData  # noqa: PLC0415 - as above
+
     first = _FIRST_SUITE if _FIRST_SUITE in release.suites else release.suites[0]
+    configs: list[dict[str, Any]] = []
     for suite in release.suites:
         for kind, name in (("queries", suite), ("truth", f"{suite}-{TRUTHS}")):
             tables = release.tables_of(suite, kind=kind)
             if tables:
-                yield f"- config_name: {quoted(name)}"
-                if name == first:
-                    yield "  default: true"
-                yield "  data_files:"
-                for part, paths in tables.items():
-                    yield f"  - split: {quoted(part)}"
-                    yield "    path:"
-                    yield from (f"    - {quoted(path)}" for path in paths)
+                files = [{"split": part, "path": list(paths)} for part, paths in tables.items()]
+                configs.append(
+                    {"config_name": name, **({"default": True} if name == first else {}), "data_files": files}
+                )
+    data = DatasetCardData(
+        license="odbl",
+        pretty_name="sasgeo-bench",
+        size_categories=[next((name for most, name in _SIZES if release.queries < most), "n>1M")],
+        tags=["geospatial", "OpenStreetMap", "UAV", "map-localization"],
+        attribution=release.credit,
+        configs=configs,
+    )
+    return data.to_yaml()
 
 
 def _opening(release: Release) -> str:

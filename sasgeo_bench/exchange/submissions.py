@@ -331,6 +331,7 @@ def beside_stored(stored: Path, submission: Path, board: Path, *, root: Path = P
     is scored anew. Arguments and errors as of `with_submissions`.
     """
     request = _request(stored, [submission], board, root=root, jobs=jobs)
+    request = replace(request, added=[submission.resolve().name])  # the name of its matcher, too
     reason = why_anew(
         read_board_manifest(stored), [rule.card for rule in rules_of(request.rejectors, request.split).values()]
     )

@@ -11,7 +11,7 @@ from sasgeo_bench.boards.archive_file import is_pack, read_pack
 from sasgeo_bench.boards.board_files import read_board_manifest
 from sasgeo_bench.boards.manifests import BoardManifest
 from sasgeo_bench.boards.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
-from sasgeo_bench.core.errors import ConfigError, StoreError, counted
+from sasgeo_bench.core.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.exchange.release_files import BoardTasks
 from sasgeo_bench.experiments.entry_cost import fetch_extracts
@@ -134,12 +134,22 @@ def _check_version(stored: Path) -> None:
     about = read_board_manifest(stored)
     here = _version_text(f"sasgeo-bench {package_version()}", DATA_VERSION, TASK_VERSION)
     if (about.data_version or DATA_VERSION) != DATA_VERSION:
+        beside = stored.resolve()
+        others = [name for name in sorted(_boards_beside(beside)) if _is_of_this_version(beside.with_name(name))]
         raise ConfigError(
             f"{stored} was made by {_version_of(about)}, and this is {here}, which makes other maps: enter it with the "
-            "version that made it, or enter a board of this one"
+            f"version that made it, or enter a board of this one ({', '.join(others) or 'none lies beside it'})"
         )
     if (about.task_version or TASK_VERSION) != TASK_VERSION:
         tell(f"{stored} was made by {_version_of(about)}, this is {here}: queries are held against its hashes")
+
+
+def _is_of_this_version(folder: Path) -> bool:
+    """Return whether a stored board is on maps that this version makes; one that cannot be read is not."""
+    try:
+        return read_board_manifest(folder).data_version == DATA_VERSION
+    except SasgeoError:
+        return False
 
 
 def _check_seed(stored: Path, seed: PrivateSeed | None) -> None:

@@ -86,6 +86,7 @@ def run_pipeline(
         draws=plan.spec.draws,
         pipeline=plan.spec.identity,
         title=plan.spec.title,
+        added=[names[one] for one in plan.added if one in names],
         by_region=() if plan.spec.paper is None or len(plan.spec.paper.seeds) == 1 else tuple(plan.spec.paper.crops),
         by_block=() if plan.spec.paper is None else tuple(plan.spec.paper.crops),
         jobs=plan.jobs,

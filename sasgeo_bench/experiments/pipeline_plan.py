@@ -216,7 +216,8 @@ class PipelinePlan:
     With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
     cluster to run on instead. `seal` tells of sealed places, `experiment` draws trials of its own, each None without
     any. `only` are the hashes of the queries to ask, all without it; those whose answer was written before the stamp
-    `since_ns` are asked again. `within` and `require` are limits and requirements of the board, as of `ScoreRequest`.
+    `since_ns` are asked again. `within` and `require` are limits and requirements of the board, as of `ScoreRequest`,
+    and `added` the matchers of `spec` that its file does not name. Without `is_sandboxed`, matchers are trusted code.
     """
 
     spec: PipelineFile
@@ -232,6 +233,8 @@ class PipelinePlan:
     since_ns: int = 0
     within: Sequence[str] = ()
     require: Sequence[str] = ()
+    is_sandboxed: bool = True
+    added: Sequence[str] = ()
 
     @property
     def split(self) -> Split | None:
@@ -614,6 +617,7 @@ def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]
             hidden=plan.seed_files,
             only=plan.only,
             since_ns=plan.since_ns,
+            is_sandboxed=plan.is_sandboxed,
         )
     )
     if is_oracle and not is_unranked(whole.card.name):

@@ -149,10 +149,10 @@ class Trajectory:
         turned = Slerp(self.time_s, self.rotation)(times) if len(self) > 1 else self.rotation
         return type(self)(time_s=times, position_m=position, quaternion_xyzw=turned.as_quat())
 
-    def plot(self, region: "Region") -> "Figure":
+    def plot(self, region: "Region", *, width_mm: float | None = None) -> "Figure":
         """Draw the flight over a map in one call; see `sgb.plot_flight`."""
         # By its public name: the drawing stands below in the order of folders
-        return cast("Figure", import_module("sasgeo_bench").plot_flight(self, region))
+        return cast("Figure", import_module("sasgeo_bench").plot_flight(self, region, width_mm=width_mm))
 
     def span_text(self) -> str:
         """Return from when to when it goes, for messages; times may count from 1970, so to the millisecond."""

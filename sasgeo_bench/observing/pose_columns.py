@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, cast
 
 import numpy as np
 import pyproj
@@ -172,6 +172,7 @@ _MOMENT: Final = re.compile(
 _PLAIN_UNIT: Final = re.compile(r"[\[(](?:decimal )?(?:degrees?|units?)[\])]", re.IGNORECASE)
 _LETTERS: Final = MappingProxyType({"longitude": "EW", "latitude": "NS"})
 _BODY: Final = ("yaw", "pitch", "roll")
+_OPEN_DATUM: Final = re.compile(r"^(D_)?(unknown|not[ _]specified)", re.IGNORECASE)
 _NO_PLACE, NO_NUMBER = "without a position", "whose position is no number"
 _NO_SIDE: Final = "whose position does not say N or S, E or W"
 
@@ -295,16 +296,35 @@ def _epsg_of(path: Path, comments: Sequence[str]) -> int | None:
     return None
 
 
-def epsg_of_wkt(path: Path, wkt: str) -> int | None:
-    """Return the EPSG code of a CRS without its heights; None if it is local; raise `PoseError` if it has none."""
+def crs_of_wkt(path: Path, wkt: str) -> pyproj.CRS | None:
+    """Return a CRS without its heights and its TOWGS84, which Metashape adds; None if it is local.
+
+    Raise `PoseError` if it is not known.
+    """
     if not wkt or wkt.startswith(("LOCAL_CS", "ENGCRS")):
         return None
     try:
         crs = pyproj.CRS.from_user_input(wkt)
     except CRSError as error:
         raise PoseError(f"{path.name} states a CRS that is not known: export it in one with an EPSG code") from error
-    crs = crs.sub_crs_list[0] if crs.is_compound else crs
-    epsg = crs.to_2d().to_epsg(min_confidence=70)
+    while crs.is_compound or crs.is_bound:
+        crs = crs.sub_crs_list[0] if crs.is_compound else cast("pyproj.CRS", crs.source_crs)
+    return crs
+
+
+def epsg_of_wkt(path: Path, wkt: str) -> int | None:
+    """Return the EPSG code of a CRS without its heights; None if it is local; raise `PoseError` if it has none."""
+    crs = crs_of_wkt(path, wkt)
+    return None if crs is None else epsg_of_crs(path, crs)
+
+
+def epsg_of_crs(path: Path, crs: pyproj.CRS) -> int:
+    """Return the EPSG code of a CRS; raise `PoseError` if it has none, or its datum is open."""
+    datum, size_m = crs.datum, math.nan if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre
+    # pyproj takes any datum of the ellipsoid, a hundred metres off; those of this size are WGS 84 within metres.
+    is_open = datum is not None and _OPEN_DATUM.search(datum.name) and size_m != 6_378_137.0
+    # to_2d changes axes that WKT leaves open, and the code is then no longer found
+    epsg = None if is_open else crs.to_epsg(min_confidence=70) or crs.to_2d().to_epsg(min_confidence=70)
     if epsg is None:
         raise PoseError(f"{path.name} is in {plain(crs.name)}, which has no EPSG code: export it in a CRS that has one")
     return int(epsg)

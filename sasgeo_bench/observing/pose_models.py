@@ -39,6 +39,8 @@ from sasgeo_bench.observing.pose_columns import (
     Read,
     Sheet,
     bytes_of,
+    crs_of_wkt,
+    epsg_of_crs,
     epsg_of_wkt,
     name_of,
     number_in,
@@ -417,16 +419,14 @@ def _aligned(
 ) -> list[PicturePose]:
     """Return the poses that Metashape found: camera to chunk, then chunk to earth-centred axes, or to local ones."""
     wkt = (chunk.findtext("reference") or "").strip()
-    is_local = not wkt or wkt.startswith(("LOCAL_CS", "ENGCRS"))
+    crs = crs_of_wkt(path, wkt)
+    is_local = crs is None
     frames = {one.get("id"): _similarity(one.find("transform")) for one in chunk.iter("component")}
     frames[None] = _similarity(chunk.find("transform"))
     lenses = {one.get("id"): _metashape_lens(one) for one in chunk.iter("sensor")}
-    crs = None if is_local else pyproj.CRS.from_user_input(wkt)
     geodetic = None if crs is None else crs.geodetic_crs
     ellipsoid = None if geodetic is None else geodetic.ellipsoid
-    epsg = WGS84 if geodetic is None else geodetic.to_2d().to_epsg()
-    if epsg is None:
-        raise PoseError(f"{path.name} is in {plain(crs.name)}, whose datum has no EPSG code: export it by WGS 84")  # type: ignore[union-attr]
+    epsg = WGS84 if geodetic is None else epsg_of_crs(path, geodetic)
     poses: list[PicturePose] = []
     local = _Model()
     for one in cameras:

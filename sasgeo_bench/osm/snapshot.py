@@ -4,10 +4,10 @@
 import datetime as dt
 from array import array
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from shutil import copyfileobj
+from shutil import copyfile, copyfileobj
 from typing import Any, Final
 
 import numpy as np
@@ -210,7 +210,10 @@ def _as_its_content(path: Path, scratch: Path) -> Path:
     if path.name.endswith(suffix):
         return path
     link = scratch / f"extract{suffix}"
-    link.symlink_to(path.resolve())
+    with suppress(OSError):  # Windows asks for a right that few users have
+        link.symlink_to(path.resolve())
+        return link
+    copyfile(path, link)
     return link
 
 

@@ -21,7 +21,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import LOG, our_failure
 from sasgeo_bench.running.oracle import Oracle
 from sasgeo_bench.running.plan import RunPart, RunPlan, by_map, reach_of
-from sasgeo_bench.running.sandbox import PROMISES, joined
+from sasgeo_bench.running.sandbox import PROMISES, UNGUARDED, joined
 from sasgeo_bench.running.worker import Reply, Worker, guarded
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_files import answer_hash
@@ -478,7 +478,7 @@ class _Writer:
 
 def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
     is_described = "truth" in worker.isolation
-    isolation = {} if is_described else dict.fromkeys(PROMISES, "trusted code, not shut in")
+    isolation = {} if is_described else dict.fromkeys(PROMISES, UNGUARDED)
     return Cost(
         prepare_s=ready.own_s if ready.own_s is None or ready.seconds is None else min(ready.own_s, ready.seconds),
         index_bytes=ready.grown_bytes,

@@ -9,12 +9,13 @@ from importlib import import_module
 from importlib.util import LazyLoader, find_spec, module_from_spec
 
 from sasgeo_bench.running import wire
+from sasgeo_bench.running.channel import far_end
 
 
 def main() -> None:
-    """Serve the runner at the other end of the socket whose number is the only argument."""
+    """Serve the runner at the other end of the socket that the only argument names."""
     gc.disable()  # until our own is imported, of which nothing is garbage: an eighth of what a process takes to start
-    channel = socket.socket(fileno=int(sys.argv[1]))
+    channel = far_end(sys.argv[1])
     start, luggage = wire.receive(channel)
     serve(channel, luggage, **start)
 

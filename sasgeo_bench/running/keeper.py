@@ -93,10 +93,11 @@ def main() -> None:
 
     Whoever ordered it may have ended meanwhile; what is interrupted, or takes too long, leaves nothing behind.
     """
-    for number in (signal.SIGTERM, signal.SIGALRM, signal.SIGHUP, signal.SIGINT):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as `nohup` or a shell's `&` have it
-            signal.signal(number, _stop)
-    signal.alarm(LONGEST_S)
+    if sys.platform != "win32":
+        for number in (signal.SIGTERM, signal.SIGALRM, signal.SIGHUP, signal.SIGINT):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as `nohup` or a shell's `&` have it
+                signal.signal(number, _stop)
+        signal.alarm(LONGEST_S)
     order, faults = json.loads(sys.stdin.read()), []
     if order["code"] != code_hash():  # it would lie under the name of what other code makes
         raise StoreError("the program was changed meanwhile")
@@ -110,5 +111,6 @@ def main() -> None:
 
 
 def _stop(number: int, _: object) -> None:
-    signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)  # libraries swallow it while they are imported
+    if sys.platform != "win32":
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)  # libraries swallow it while they are imported
     sys.exit(f"it was stopped by {signal.Signals(number).name}")

@@ -31,8 +31,8 @@ from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import read_manifest
 
 LEAST_CELLS: Final = 2048**2  # of a map: a smaller one is made in less time than a process takes to start
-# Of the lowest priority that still gets a thirtieth of a processor, where matchers want all of them
-_MAKER: Final = "import os; os.nice(15); from sasgeo_bench.running.keeper import main; main()"
+# Of the lowest priority that still gets a thirtieth of a processor, where matchers want all of them; Windows has none
+_MAKER: Final = "import os; getattr(os, 'nice', int)(15); from sasgeo_bench.running.keeper import main; main()"
 _BEGUN: Final = threading.Lock()  # taken once, by who starts the thread that serves orders
 _ORDERS: Final = Queue[tuple[Path, list[Mapping[str, Any]]]]()
 
@@ -128,7 +128,10 @@ def _is_worth_it(manifest: Manifest) -> bool:
 
 
 def _make(ordered: str) -> None:
-    with TemporaryFile("w+") as asked, TemporaryFile("w+", errors="replace") as said:  # pipes end with this process
+    with (  # pipes would end with this process
+        TemporaryFile("w+", encoding="utf-8") as asked,
+        TemporaryFile("w+", encoding="utf-8", errors="replace") as said,
+    ):
         asked.write(ordered)
         asked.seek(0)
         command = [sys.executable, "-P", "-c", _MAKER]

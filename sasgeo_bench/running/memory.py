@@ -41,7 +41,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of malloc.h
 
 def be_lean() -> None:
     """Let this process, from now on, keep little of what it freed; does nothing where the C library has no such way."""
-    if not sys.platform.startswith("linux"):
+    if sys.platform != "linux":
         return
     adjust = getattr(ctypes.CDLL(None), "mallopt", None)  # of glibc; others may lack it
     if adjust is not None:
@@ -220,6 +220,7 @@ _MAPPING: Final = re.compile(
     rb"[0-9a-f]+-[0-9a-f]+ \S{4} [0-9a-f]+ (?P<major>[0-9a-f]+):(?P<minor>[0-9a-f]+) (?P<inode>\d+)"
 )
 _SHARE: Final = re.compile(rb"Pss: +(?P<kb>\d+) kB")
+_HAS_PROC: Final = sys.platform == "linux"  # elsewhere resident memory is all there is, and no file in memory is seen
 _KB: Final = 1024
 _BLOCK: Final = 512
 
@@ -282,8 +283,8 @@ class MemoryWatch:
         family = _family(self.process.pid)
         shared = _shared(family, self.scratch)
         estimate = _resident_bytes(family) + shared.bytes
-        # Exact, which takes longer, only where pages may count twice and the estimate has grown.
-        if len(family) > _USUAL or shared.bytes or estimate > self.most_bytes:
+        # Exact, which takes longer, only where pages may count twice and the estimate has grown; by Linux alone.
+        if _HAS_PROC and (len(family) > _USUAL or shared.bytes or estimate > self.most_bytes):
             if estimate > max(self._estimated * _GROWN, self._sampled) or estimate > self.most_bytes:
                 self._estimated = estimate
                 estimate = min(estimate, _exact_bytes(family, shared))
@@ -350,7 +351,7 @@ def _shared(family: Sequence[int], scratch: Path) -> _Shared:
     """Find in-memory files that some processes hold open, and their scratch folder if it lies in memory."""
     sizes: dict[tuple[int, int], int] = {}
     used, device = 0, -1
-    for number in family:
+    for number in family if _HAS_PROC else ():
         try:
             for entry in os.scandir(f"/proc/{number}/fd"):
                 if os.readlink(entry.path).startswith(_SHARED):  # noqa: PTH115 - not a path

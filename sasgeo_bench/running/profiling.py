@@ -3,6 +3,7 @@
 
 import math
 import os
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -271,6 +272,8 @@ def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> tupl
 @contextmanager
 def _pinned(cores: int) -> Iterator[list[int]]:
     """Keep this thread, and the processes that it starts, on some processors."""
+    if sys.platform != "linux":
+        raise ConfigError("this system keeps no process on some of its cores: measure on Linux")
     before = sorted(os.sched_getaffinity(0))
     if not 0 < cores <= len(before):
         raise ConfigError(f"this computer gives us {counted(len(before), 'core')}, not {cores}")

@@ -6,7 +6,6 @@ than one thread. Afterwards start a new program: the old one still holds files o
 """
 
 import os
-import resource
 import signal
 import struct
 import sys
@@ -17,6 +16,9 @@ from typing import Final, NoReturn
 
 from sasgeo_bench.running import kernel
 from sasgeo_bench.running.kernel import READ_RIGHTS, WRITE_RIGHT, around, landlock_version, outermost, restrict
+
+if sys.platform != "win32":
+    import resource
 
 # ruff: noqa: PTH102, PTH103, PTH110, PTH112, PTH114, PTH115, PTH120, PTH123, PTH208, PTH211
 # Without pathlib, which is slow to load: this runs before the sandbox is closed.
@@ -318,6 +320,18 @@ def joined(isolations: Iterable[Mapping[str, str]]) -> dict[str, str]:
         for name, text in isolation.items():
             words.setdefault(name, []).extend(text.split(_AND))
     return {name: _AND.join(dict.fromkeys(texts)) for name, texts in words.items()}
+
+
+UNGUARDED: Final = "trusted code, not shut in"  # each promise of a run without the sandbox
+
+
+def is_unguarded(isolation: Mapping[str, str]) -> bool:
+    """Return whether any process of a run was outside the sandbox.
+
+    >>> [is_unguarded({"truth": words}) for words in ("not in its root", "not in its root | trusted code, not shut in")]
+    [False, True]
+    """
+    return UNGUARDED in isolation.get("truth", "").split(_AND)
 
 
 def keeps_truth(isolation: Mapping[str, str]) -> bool:

@@ -25,7 +25,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue, Ty
 
 import sasgeo_bench.running.child
 from sasgeo_bench.core.config import shipped_dir
-from sasgeo_bench.core.errors import MatchError, StoreError
+from sasgeo_bench.core.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.core.folders import scratch_folder
 from sasgeo_bench.core.plugins import check_card_name, import_paths
 from sasgeo_bench.core.room import Room
@@ -47,6 +47,7 @@ from sasgeo_bench.matching.matcher import (
 )
 from sasgeo_bench.matching.tracker import ROW, check_prediction
 from sasgeo_bench.running import sandbox, wire
+from sasgeo_bench.running.channel import start_process
 from sasgeo_bench.running.failures import LOG, is_disk_error, our_failure
 from sasgeo_bench.running.kept import kept_of, order, shelf_of
 from sasgeo_bench.running.launch import PROGRAM
@@ -175,7 +176,7 @@ _SOUND: Final = TypeAdapter(_Sound)
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
 _KEPT_BYTES: Final = 4000  # of a matcher's output
 _START_S: Final = 120.0
-_PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
+_PASSED_ON: Final = ("LANG", "LC_ALL", "TZ", "SYSTEMROOT")  # without the last one Python does not start on Windows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,6 +204,13 @@ class Reach:
     readable: Sequence[Path]
     hidden: Sequence[Path]
     is_sandboxed: bool = True
+
+    def __post_init__(self) -> None:
+        if self.is_sandboxed and sys.platform != "linux":
+            raise ConfigError(
+                "only Linux offers the sandbox that plugins run in: run code that you trust without it, by --trusted "
+                "(trusted=True); run.json and boards say so"
+            )
 
 
 def hidden_below(roots: Sequence[Path]) -> list[Path]:
@@ -346,19 +354,10 @@ class PluginProcess(ABC, Generic[AnyCard, Found]):
         if self._channel is not None and not self._is_gone():
             return self._channel
         self.end()
-        ours, theirs = socket.socketpair()
         self._scratch = self._kept.enter_context(scratch_folder(self.door))
-        command = _command(theirs.fileno(), is_sandboxed=self.reach.is_sandboxed)
-        self._process = subprocess.Popen(  # noqa: S603 - our own module, by our own interpreter
-            command,
-            pass_fds=[theirs.fileno()],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            env=_environment(self._scratch) | (LEAN if self.is_lean else {}),
-            start_new_session=True,
-        )
-        theirs.close()
+        command = _command(is_sandboxed=self.reach.is_sandboxed)
+        environment = _environment(self._scratch) | (LEAN if self.is_lean else {})
+        self._process, ours = start_process(command, environment)
         self._begin_watch(self._process, self._scratch)
         self._printed = deque()
         self._drain = threading.Thread(target=_drain, args=(self._process.stdout, self._printed), daemon=True)
@@ -594,18 +593,19 @@ def _environment(scratch: Path) -> dict[str, str]:
     """Return a minimal environment: none of our folders, keys or proxies; one thread, for comparable latencies."""
     kept = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
-    own = {"PATH": "/usr/bin:/bin", "HOME": str(scratch), "TMPDIR": str(scratch), "PYTHONHASHSEED": "0"}
+    path = os.environ.get("PATH", "") if sys.platform == "win32" else "/usr/bin:/bin"  # there libraries are found by it
+    own = {"PATH": path, "PYTHONHASHSEED": "0"} | dict.fromkeys(("HOME", "USERPROFILE", "TMPDIR"), str(scratch))
     # Plugins of pydantic, of which we have none, would be looked for in all that is installed: 15 ms of each start.
     # Arrow's own pool keeps what was freed, and so does a heap for each thread: 25 MB each of a map of 16 km2.
     own |= {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "1"}
     return {**kept, **threads, **own, "PYTHONDONTWRITEBYTECODE": "1", "PYDANTIC_DISABLE_PLUGINS": "__all__"}
 
 
-def _command(channel: int, *, is_sandboxed: bool) -> list[str]:
+def _command(*, is_sandboxed: bool) -> list[str]:
     if not is_sandboxed:
-        return [sys.executable, *_ANSWERS, str(channel)]
+        return [sys.executable, *_ANSWERS]
     package = str(Path(sasgeo_bench.running.child.__file__).parents[2])
-    return [sys.executable, "-I", "-S", "-c", PROGRAM, package, *_ANSWERS, str(channel)]
+    return [sys.executable, "-I", "-S", "-c", PROGRAM, package, *_ANSWERS]
 
 
 def _open_cache(read: Sequence[Path]) -> list[str]:
@@ -651,7 +651,10 @@ def _kill_family(process: subprocess.Popen[bytes]) -> None:
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=5.0)  # for the keeper of a matcher's process to end all its descendants
     try:
-        os.killpg(process.pid, signal.SIGKILL)
+        if sys.platform == "win32":
+            process.kill()
+        else:
+            os.killpg(process.pid, signal.SIGKILL)
     except (ProcessLookupError, PermissionError):
         process.kill()
     for member in family:

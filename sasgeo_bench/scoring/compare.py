@@ -399,7 +399,8 @@ LESS: Final = frozenset({"interaction", "shift"})  # differences of a figure and
 RELATIVE: Final = frozenset({"aurc", "e_aurc"})  # their least difference is a share of the second side
 LOWER: Final = RELATIVE | {"false_accepted"}  # less is better
 _NO_FINDING: Final = 1e-9  # a smaller excess is a rounding error
-Outcome = Literal["decided", "decided, small", "cause open", "null", "not decided", "not tested"]
+Outcome = Literal["decided", "decided, small", "cause open", "equal", "not decided", "not tested"]
+BETTER: Final[frozenset[Outcome]] = frozenset({"decided", "decided, small", "cause open"})  # in which one is better
 
 
 def attainable(best: float, second: float, *, is_lower_better: bool) -> float:
@@ -547,6 +548,11 @@ class Finding:
         return self.first if (self.difference > 0) != self.is_lower_better else self.second
 
     @property
+    def loser(self) -> str:
+        """Return the other side."""
+        return self.second if self.winner == self.first else self.first
+
+    @property
     def outcome(self) -> Outcome:
         """Return the verdict in a word."""
         if not self.n:
@@ -557,7 +563,7 @@ class Finding:
             if max(map(abs, self.ends)) < self.least:
                 return "decided, small"
             return "cause open" if self.gains_without_stress and self.winner == self.first else "decided"
-        return "null" if -self.least < self.ends[0] and self.ends[1] < self.least else "not decided"
+        return "equal" if -self.least < self.ends[0] and self.ends[1] < self.least else "not decided"
 
     @property
     def verdict(self) -> str:
@@ -588,14 +594,35 @@ class Finding:
         return f"{self.winner} is better{size}{cause}{self._reach}"
 
     @property
+    def headline(self) -> str:
+        """Return what came of a contrast with the names of both sides, without the reason where neither is better.
+
+        >>> found = Finding(name="age", first="with", second="without", metric="primary", n=90, blocks=30, places=18,
+        ...     best=1.0, second_value=0.6, difference=0.0, lo=-0.02, hi=0.02, p_holm=1.0, least=0.03)
+        >>> found.headline, replace(found, hi=0.2).headline
+        ('with and without are equal (within 0.03)', 'with against without: not decided')
+        >>> replace(found, difference=0.1, lo=0.04, hi=0.2, p_holm=0.01).headline
+        'with is better than without, by as much as matters'
+        """
+        if self.outcome in BETTER:
+            return f"{self.winner} is better than {self.loser}" + self.verdict.removeprefix(f"{self.winner} is better")
+        if self.outcome == "equal":
+            return f"{self.first} and {self.second} are {self._equal}"
+        return f"{self.first} against {self.second}: {self.outcome}"
+
+    @property
+    def _equal(self) -> str:
+        return f"equal (within {self.least:.2g})"
+
+    @property
     def _reach(self) -> str:
         """Return which countries a verdict is of, where they are too few to speak for others."""
         is_few = 0 < self.countries < min(self.places, LEAST_PLACES)
         return f"; of {counted(self.countries, 'country', 'countries')} alone" if is_few else ""
 
     def _unshown(self) -> str:
-        if self.outcome == "null":
-            return f"null: any difference is smaller than would matter{self._reach}"
+        if self.outcome == "equal":
+            return f"{self._equal}: any difference is smaller than would matter{self._reach}"
         if self.p_holm <= ALPHA and (self.lo > 0 or self.hi < 0):
             return "not decided: a difference is shown by places, none by countries"
         if self.lo > 0 or self.hi < 0:
@@ -621,7 +648,7 @@ CONTRAST_SCHEMA: Final = Schema(
         Column(
             "verdict",
             str,
-            "Which is better at 5 %, and whether by as much as matters; null where a difference that matters is ruled "
+            "Which is better at 5 %, and whether by as much as matters; equal where a difference that matters is ruled "
             "out; cause open where the first gains without the stress, too; not decided where neither is shown, where "
             f"less can be gained than was to matter, and with fewer than {LEAST_PLACES} places",
             "verdict",

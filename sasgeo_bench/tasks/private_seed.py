@@ -140,7 +140,7 @@ def _read(file: Path) -> str:
         raise StoreError(
             f"{file} cannot be read ({error.strerror or error}): name a file with a seed that you can read"
         ) from error
-    if status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+    if sys.platform != "win32" and status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):  # there these bits say nothing
         raise StoreError(f"{file} can be read by others (mode {stat.S_IMODE(status.st_mode):03o}): chmod 600 {file}")
     return text.strip()
 

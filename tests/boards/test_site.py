@@ -25,7 +25,6 @@ from sasgeo_bench.boards.board_tables import (
     risk_tables_by_suite,
     sections_of,
     suite_table,
-    summary,
 )
 from sasgeo_bench.boards.manifests import (
     BoardTask,
@@ -35,6 +34,7 @@ from sasgeo_bench.boards.manifests import (
     PicturesManifest,
     RegionMap,
 )
+from sasgeo_bench.boards.overview import overviews_of
 from sasgeo_bench.boards.site import site_pages
 from sasgeo_bench.boards.site_files import SiteSource, Spot
 from sasgeo_bench.boards.site_maps import draw_places, draw_rates, place_maps, places_on_map, regions_of
@@ -143,24 +143,27 @@ def test_a_table_is_sorted_by_its_figure_and_says_who_is_tied():
     assert {column.term for column in section.table.columns} <= MEANINGS.keys()
 
 
-def test_who_may_be_first_leads_in_the_overview_and_who_was_asked_about_more_comes_first():
+def test_who_may_be_first_leads_in_the_overview_which_is_sorted_by_its_first_figure():
     first = many_rows(6)
     first.loc[first["matcher"] == "matcher-003", ["rank_best", "rank_worst"]] = [5, 6]
     fewer = first[first["matcher"] != HOSTILE].assign(suite="occlusion")
-    (table,) = summary(book_of(source(pd.concat([first, fewer], ignore_index=True))))
+    (table,) = (item.shown for item in overviews_of(book_of(source(pd.concat([first, fewer], ignore_index=True)))))
     heads = [[cell.text for cell in row.cells] for row in table.rows if row.tone == "head"]
-    assert heads == [["queries", "80", "80", "-"]]
+    assert heads == [["queries", "80", "80"]]
     names = [row.cells[0].text for row in table.rows if row.tone != "head"]
-    assert names[0] == MARKUP
-    assert names[-1] == HOSTILE  # best where it was asked, which is one suite of two
-    assert [column.term for column in table.columns] == ["matcher", "success_25m", "success_25m", "mean"]
-    assert table.rows[-1].cells[-1].text == "-"
+    assert names[:2] == [HOSTILE, MARKUP]
+    assert [(column.name, column.order) for column in table.columns[1:]] == [
+        ("real-age", "descending"),
+        ("occlusion", "none"),
+    ]
+    assert table.rows[1].cells[-1].text == "-"
+    assert {row.tone for row in table.rows[1:]} == {"tied"}
     tones = {row.cells[0].text: row.cells[1].tone for row in table.rows}
     assert [tones[name] for name in (MARKUP, HOSTILE, "matcher-003")] == ["leading", "leading", "plain"]
 
 
 def test_who_has_no_rival_does_not_lead():
-    (table,) = summary(book_of(source(many_rows(1))))
+    (table,) = (item.shown for item in overviews_of(book_of(source(many_rows(1)))))
     assert [row.cells[1].tone for row in table.rows] == ["plain", "plain"]  # the first says how many queries count
 
 
@@ -213,8 +216,8 @@ def test_a_matcher_that_cannot_has_words_and_no_figure():
         ({"least": 0.2}, "decided, small", "graph is better than raster, by less than would matter", ""),
         (
             {"least": 0.2, "p_holm": 1.0},
-            "null",
-            "graph against raster",
+            "equal",
+            "graph and raster are equal (within 0.2)",
             "any difference is smaller than would matter",
         ),
         ({"places": 2}, "not decided", "graph against raster", "2 places, at least 6 are needed"),
@@ -224,7 +227,7 @@ def test_a_matcher_that_cannot_has_words_and_no_figure():
 def test_a_contrast_is_reported_in_words_with_figure_interval_p_and_counts(changes, outcome, headline, because):
     (result,) = contrasts_of(source(findings=[replace(FINDING, **changes)]))
     assert (result.outcome, result.headline, result.because) == (outcome, headline, because)
-    if result.outcome == "null":
+    if result.outcome == "equal":
         assert result.facts[0] == "adjusted p 1.000 (Holm, 1 contrast)"
     elif "n" not in changes:
         assert result.sentence.startswith("Difference 0.100 [0.040, 0.160] in the share of queries that are right")
@@ -494,7 +497,9 @@ def test_answers_that_lie_nowhere_are_refused_by_row(column, value):
 
 def test_false_fixes_stand_beside_the_success_of_a_suite_with_absent_places():
     absent = many_rows(3).assign(metric="answered_absent", stratum="all", n=30, rank_best=pd.NA, rank_worst=pd.NA)
-    (table,) = summary(book_of(source(pd.concat([many_rows(3), absent], ignore_index=True))))
+    (table,) = (
+        item.shown for item in overviews_of(book_of(source(pd.concat([many_rows(3), absent], ignore_index=True))))
+    )
     assert [column.name for column in table.columns] == ["matcher", "real-age: on the map", "real-age: false fixes"]
     heads, first, *_ = table.rows
     assert [cell.text for cell in heads.cells] == ["queries", "80", "30"]
@@ -505,10 +510,12 @@ def test_false_fixes_stand_beside_the_success_of_a_suite_with_absent_places():
 
 def test_a_ceiling_below_one_is_explained_with_the_oracle_that_passes_it():
     most = many_rows(3).assign(metric="ceiling", value=0.625)
-    (table,) = summary(book_of(source(pd.concat([many_rows(3), most], ignore_index=True))))
+    (table,) = (
+        item.shown for item in overviews_of(book_of(source(pd.concat([many_rows(3), most], ignore_index=True))))
+    )
     assert [cell.text for cell in table.rows[1].cells] == ["at most", "0.625"]
     assert table.notes[-1].endswith("An oracle gets the answer and passes it.")
-    (plain,) = summary(book_of(source()))
+    (plain,) = (item.shown for item in overviews_of(book_of(source())))
     assert not any(note.startswith("at most") for note in plain.notes)
 
 
@@ -517,7 +524,7 @@ def test_the_column_of_a_suite_says_what_is_done_and_which_steps_its_figure_pool
     rows |= {"role": ["control", *["stress"] * 3], "kind": ["control", "S1", "S1", "S2"], "is_present": True}
     rows |= {"strength": [0.0, 10.0, 2.0, 5.0], "strength_unit": "years, about: age_years is what they are"}
     given = source(table=many_rows(2), scores=pd.DataFrame(rows))
-    (table,) = summary(book_of(given))
+    (table,) = (item.shown for item in overviews_of(book_of(given)))
     assert table.columns[1].meaning.startswith("Real ageing (S1). The map is that of an extract")
     assert table.columns[1].meaning.endswith("Counted, each query alike: S1 at 2, 10; S2 (years, about)")
     (section,) = sections_of(book_of(given))

@@ -191,7 +191,7 @@ def test_the_keyboard_alone_reads_sorts_and_turns(page, site):
     assert page.value("document.activeElement.className") == "skip"
     page.press("Enter")
     until(page, "document.activeElement.id === 'main'")
-    for _ in range(60):
+    for _ in range(200):
         page.press("Tab")
         if page.value("document.activeElement.textContent") == "success_25m":
             break
@@ -203,6 +203,31 @@ def test_the_keyboard_alone_reads_sorts_and_turns(page, site):
     assert page.value("getComputedStyle(document.activeElement.nextElementSibling).visibility") == "hidden"
     page.press("Enter")
     until(page, "document.activeElement.closest('th').getAttribute('aria-sort') === 'ascending'")
+
+
+@pytest.mark.parametrize("width", rest_slow([WIDE, 390]))
+def test_sentences_plot_and_table_are_on_the_first_screen(page, site, width):
+    page.width(width, height=800)
+    page.open(address(site))
+    parts = "['.says', '.plot img', '.matrix tbody + tbody tr']"
+    ends = page.value(f"{parts}.map((one) => document.querySelector(one).getBoundingClientRect().bottom)")
+    assert max(ends) <= 800
+
+
+def test_intervals_of_the_first_table_are_shown_on_request_without_a_script(page, site):
+    page.scripts(are_on=False)
+    page.open(address(site))
+    shown = "getComputedStyle(document.querySelector('.matrix td .ends')).display"
+    assert page.value(shown) == "none"
+    page.value("document.querySelector('.with-ends').click()")
+    assert page.value(shown) == "block"
+
+
+def test_a_word_of_the_trade_is_explained_where_it_has_the_focus(page, site):
+    page.open(address(site))
+    page.value("document.querySelector('.term').focus()")
+    assert page.value("getComputedStyle(document.querySelector('.term + .tip')).visibility") == "visible"
+    assert page.value("document.documentElement.scrollWidth") <= WIDE
 
 
 def test_a_tip_is_shown_whole_under_the_pointer(page, site):

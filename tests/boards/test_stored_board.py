@@ -3,6 +3,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -77,9 +79,74 @@ def test_risk_is_drawn_for_matchers_that_give_a_confidence(board):
     assert {title for title in titles if title} <= set(sure["matcher"])
 
 
+# --- on paper ---------------------------------------------------------------------------------------------------------
+
+ON_PAPER = {
+    "tradeoff": lambda board: board("towns").plot_tradeoff("clean", width_mm=85),
+    "contrasts": lambda board: board("towns").plot_contrasts(width_mm=85),
+    "forest": lambda board: board("towns").plot_forest(_first_contrast(board("towns")), width_mm=85),
+    "risk": lambda board: board("towns").plot_risk(GROUP, width_mm=85),
+    "age": lambda board: board("modules").plot_steps("real-age", GROUP, width_mm=85),
+    "strength": lambda board: board("modules").plot_steps("occlusion", GROUP, width_mm=85),
+    "distance": lambda board: board("flights").plot_distance("flight-gap", GROUP, width_mm=85),
+    "stanford": lambda board: board("modules").plot_stanford(GROUP, matcher="sasgeo", width_mm=85),
+}
+
+
+@cache
+def stored(name):
+    return sgb.read_board(TOWNS.with_name(name))
+
+
+def _first_contrast(board):
+    return next(one.name for one in board.findings if one.n)
+
+
+@pytest.mark.parametrize("name", ON_PAPER)
+def test_a_figure_on_paper_is_a_column_wide_and_all_its_letters_can_be_read(name, tmp_path):
+    figure = ON_PAPER[name](stored)
+    wide, high = figure.get_size_inches() * 25.4
+    assert wide == pytest.approx(85)
+    assert 30 < high < 250
+    figure.draw_without_rendering()
+    shown = [one for one in figure.findobj(Text) if one.get_visible() and one.get_text().strip()]
+    assert min(one.get_fontsize() for one in shown) >= 5.5
+    drawn, (across, up) = figure.get_tightbbox(), figure.get_size_inches()  # a tick beyond its axis is not drawn
+    assert min(drawn.x0, drawn.y0, across - drawn.x1, up - drawn.y1) > -0.01
+    assert len(figure.caption) > 50
+    assert "OpenStreetMap" in " ".join(one.get_text() for one in shown)
+    for kind in ("svg", "pdf"):
+        figure.savefig(tmp_path / f"figure.{kind}")
+    assert b"/Subtype /Type3" not in (tmp_path / "figure.pdf").read_bytes()
+    assert ">Data: " in (tmp_path / "figure.svg").read_text(encoding="utf-8")  # letters, not outlines
+
+
+def test_a_figure_on_a_page_is_as_it_was_after_one_on_paper(board):
+    before = board.plot_contrasts()
+    board.plot_contrasts(width_mm=85)
+    after = board.plot_contrasts()
+    assert before.get_size_inches().tolist() == after.get_size_inches().tolist()
+    assert texts(before) == texts(after)
+    assert after.caption == ""
+
+
+@pytest.mark.parametrize("width_mm", [0, 20, float("nan"), 5000])
+def test_a_width_that_no_paper_has_is_refused(board, width_mm):
+    with pytest.raises(ConfigError, match="width_mm is from 60 to 400, as 85 for a column"):
+        board.plot_contrasts(width_mm=width_mm)
+
+
 @pytest.mark.parametrize(
     ("ask", "fault"),
     [
+        (lambda board: board.plot_forest("no-such"), r"has no answered contrast 'no-such': it has "),
+        (lambda board: board.plot_steps("no-such", GROUP), r"has no steps of 'no-such', localization, 'r500-weak-s3'"),
+        (lambda board: board.plot_distance("clean", GROUP), r"has no flights of 'clean', 'r500-weak-s3': the columns"),
+        (lambda board: board.plot_stanford("r1-weak-s3"), r"has no protection levels at risk 0.01 of any matcher"),
+        (
+            lambda board: replace(board, folder=Path("nowhere")).plot_stanford(GROUP),
+            r"nowhere holds a board alone, and this figure needs truths and answers",
+        ),
         (lambda board: board.plot_tradeoff("no-such-suite"), r"has no latencies of 'no-such-suite', localization: its"),
         (
             lambda board: board.plot_risk("r1-weak-s3"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 
+from sasgeo_bench.boards.headroom import headroom_of, read_headroom
 from sasgeo_bench.core.config import shipped_dir
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import PRESENT
@@ -177,12 +178,18 @@ def test_real_ageing_of_a_region_with_one_date_gets_one_line(program, tmp_path):
 # --- list suites ----------------------------------------------------------------------------------------------------
 
 
-def test_all_suites_are_listed_with_what_they_separate(program):
+def test_all_suites_are_listed_with_what_they_separate_most_headroom_first(program):
     code, printed, err = program("list", "suites")
-    assert (code, err) == (0, "")
+    assert code == 0
+    assert err.startswith("headroom: the most that could be gained")
     lines = printed.splitlines()
     listed = [line.split()[0] for line in lines[1:] if line.strip()]
-    assert listed[: len(EVERY_SUITE)] == list(EVERY_SUITE)  # suites of installed packages follow
+    first = list(dict.fromkeys(one.suite for one in read_headroom()))  # as docs/unsolved.md has them
+    assert listed[: len(first)] == first
+    assert listed[len(first) : len(EVERY_SUITE)] == [name for name in EVERY_SUITE if name not in first]
+    for best in map(headroom_of, first):
+        line = next(line for line in lines if line.startswith(f"{best.suite} "))
+        assert (f" {best.headroom:.2f}" if best.state == "open" else f" {best.state} ") in line
     assert len(SUITES) == 19
     for name, suite in EVERY_SUITE.items():
         line = next(line for line in lines if line.startswith(f"{name} "))

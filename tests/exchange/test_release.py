@@ -26,6 +26,7 @@ import pytest
 import rasterio
 import shapely
 from affine import Affine
+from huggingface_hub import DatasetCard
 from PIL import Image
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from rio_cogeo.cogeo import cog_validate
@@ -217,6 +218,24 @@ def test_public_libraries_alone_load_every_file(written: Path, source: Path, tmp
         assert found["layers"][name][2] == f"EPSG:{about.epsg}"
         assert found["features"][name] == pq.read_metadata(source / "regions" / name / "features.parquet").num_rows
         assert min(found["nodes"][name], found["edges"][name]) > 0
+
+
+def test_the_hub_reads_the_head_of_the_card(written: Path) -> None:
+    data = DatasetCard.load(written / "README.md").data
+    assert (data.license, data.size_categories) == ("odbl", ["n<1K"])
+    assert "OpenStreetMap" in data.attribution
+    assert [one["config_name"] for one in data.configs] == ["alias", "alias-truth", "clean", "clean-truth"]
+    assert [one["config_name"] for one in data.configs if one.get("default")] == ["clean"]
+    paths = [path for one in data.configs for files in one["data_files"] for path in files["path"]]
+    assert len(paths) == 4
+    assert all((written / path).is_file() for path in paths)
+
+
+def test_the_command_of_the_guide_is_one_of_the_hub() -> None:
+    text = (Path(__file__).parents[2] / "docs/howto/release.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^hf upload \S+ \S+ \. (--[a-z-]+) dataset$", text, flags=re.MULTILINE)
+    shown = subprocess.run([Path(sys.executable).with_name("hf"), "upload", "--help"], capture_output=True, check=True)  # noqa: S603 - beside our own Python
+    assert command in shown.stdout.decode()
 
 
 def test_the_lines_of_the_card_run_and_show_what_our_own_code_sees(written: Path, tmp_path: Path) -> None:

@@ -697,3 +697,11 @@ def test_a_submission_that_has_the_name_of_another_entry_is_left_out(copied, sto
     assert code == CONTESTANT_FAILED
     assert f"{copied}: 'mine' is the name of another entry of the board: choose another name" in err
     assert [entry.name for entry in read_board_manifest(tmp_path / "boards" / "board").entries].count("mine") == 1
+
+
+def test_every_submission_of_the_repository_is_sound_for_its_board(program):
+    root = Path(__file__).parents[2]
+    for record in sorted(root.glob("submissions/*/*/submission.json")):
+        stored = root / "docs" / "results" / record.parts[-3]
+        code, _, err = program("verify", record.parent, "--for", stored)
+        assert code == 0, err

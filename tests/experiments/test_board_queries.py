@@ -17,7 +17,7 @@ from sasgeo_bench.core.errors import ConfigError
 from sasgeo_bench.exchange.release import ReleaseRequest, make_release
 from sasgeo_bench.exchange.submissions import SubmitRequest, hold_submission, make_submission
 from sasgeo_bench.experiments import board_queries
-from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, draw_board
+from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, draw_board, plan_board
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.matching.submission import Card, example_card
@@ -106,6 +106,12 @@ def test_the_program_of_the_page_answers_without_this_package(request_, released
     submission, faults = hold_submission(make_submission(asked), [request_.stored])
     assert faults == ()
     assert all(task.answered == task.queries for task in submission.tasks)
+
+
+def test_a_board_on_maps_of_another_version_is_refused_with_those_beside_it_that_are_open(tmp_path):
+    stored = PAGE.parents[1] / "results" / "towns"
+    with pytest.raises(ConfigError, match=r"data version 2, .* enter a board of this one \(.*\bsystems-objects\b.*\)$"):
+        plan_board(BoardRequest(stored=stored, out=tmp_path))
 
 
 def test_a_board_of_pictures_is_refused_before_anything_is_drawn(request_, monkeypatch):

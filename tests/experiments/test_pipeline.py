@@ -23,7 +23,7 @@ from sasgeo_bench.core.errors import ConfigError, MatchError
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.experiments import pipeline, pipeline_plan
 from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import TrainingGroups, is_asked, models_by_place, plan_pipeline
+from sasgeo_bench.experiments.pipeline_plan import TrainingGroups, is_asked, models_by_place, plan_pipeline, plan_runs
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.tasks import build as tasks
 from sasgeo_bench.tasks import task_files
@@ -189,6 +189,18 @@ def test_the_command_takes_limits_and_requirements_as_score_does(made, program, 
     assert "'most within 50 m', which is no requirement" in mistake(*words, "--require", "most within 50 m")
     assert "'7 miles' is no limit" in mistake(*words, "--within", "7 miles")
     assert len(plans) == 1
+
+
+@pytest.mark.parametrize(("words", "is_sandboxed"), [((), True), (("--trusted",), False)])
+def test_the_command_trusts_matchers_where_it_is_told_to(made, program, monkeypatch, tmp_path, words, is_sandboxed):
+    _, board, _ = made
+    plans = []
+    monkeypatch.setattr("sasgeo_bench.cli.boards.run_pipeline", lambda plan, **_: plans.append(plan) or board)
+    (tmp_path / "small.toml").write_text(TEXT, encoding="utf-8")
+    assert program("leaderboard", "small.toml", *words)[0] == 0
+    with threaded():
+        (run,) = plan_runs(plans[0], "random", [])
+    assert run.plan.request.is_sandboxed is is_sandboxed
 
 
 def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):

@@ -2,14 +2,19 @@
 """Models and trajectories: quaternions in their order, names with spaces, lenses, times, cameras that are none."""
 
 import json
+import re
 import struct
+from pathlib import Path
 
 import cv2
 import numpy as np
+import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.observing.picture_poses import PoseFacts
+from sasgeo_bench.observing.pose_columns import epsg_of_wkt
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.sensing.camera import Intrinsics
 from tests import pose_files as cameras
@@ -252,3 +257,41 @@ def test_pictures_of_a_trajectory_are_placed_by_their_times(lay):
         ("d.jpg", (10.0, 0.0), 11.0),
     ]
     assert table.left_out == {"without poses within 2 s": ("b.jpg", "c.jpg")}
+
+
+WGS84_SHIFTED = (
+    'GEOGCS["WGS 84",DATUM["World Geodetic System 1984",SPHEROID["WGS 84",6378137,298.257223563,AUTHORITY["EPSG",'
+    '"7030"]],TOWGS84[0,0,0,0,0,0,0],AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],UNIT['
+    '"degree",0.01745329251994328,AUTHORITY["EPSG","9102"]],AUTHORITY["EPSG","4326"]]'
+)
+EGM96 = (
+    'VERT_CS["EGM96 height",VERT_DATUM["EGM96 geoid",2005,AUTHORITY["EPSG","5171"]],UNIT["metre",1,AUTHORITY["EPSG",'
+    '"9001"]],AUTHORITY["EPSG","5773"]]'
+)
+
+
+@pytest.mark.parametrize("wkt", [WGS84_SHIFTED, f'COMPD_CS["WGS 84 + EGM96 height",{WGS84_SHIFTED},{EGM96}]'])
+def test_a_crs_of_metashape_with_towgs84_is_read_by_its_code(lay, wkt):
+    assert epsg_of_wkt(Path("a.txt"), wkt) == 4326
+    poses = read_pose_table(lay(cameras.metashape(wkt=wkt), "cameras.xml")).poses
+    assert {pose.epsg for pose in poses} == {4326}
+
+
+@pytest.mark.parametrize("epsg", [4326, 31467, 2193])
+def test_a_code_is_found_where_none_is_written(epsg):
+    bare = re.sub(r',AUTHORITY\["EPSG","\d+"\]', "", pyproj.CRS.from_epsg(epsg).to_wkt("WKT1_GDAL"))
+    assert epsg_of_wkt(Path("a.txt"), bare) == epsg
+
+
+@pytest.mark.parametrize("ellipsoid", ["bessel", "krass", "intl"])
+def test_an_ellipsoid_alone_is_no_datum(ellipsoid):
+    # pyproj names that of a railway, of Albania, ED50: places would be a hundred metres off
+    wkt = pyproj.CRS(f"+proj=tmerc +lon_0=9 +x_0=3500000 +ellps={ellipsoid}").to_wkt("WKT1_GDAL")
+    with pytest.raises(PoseError, match="no EPSG code"):
+        epsg_of_wkt(Path("a.txt"), wkt)
+    assert epsg_of_wkt(Path("a.txt"), pyproj.CRS("+proj=utm +zone=32 +ellps=GRS80").to_wkt()) == 25832
+
+
+def test_a_damaged_crs_of_metashape_is_one_line(lay):
+    with pytest.raises(PoseError, match="states a CRS that is not known"):
+        read_pose_table(lay(cameras.metashape(wkt='GEOGCS["WGS 84"'), "cameras.xml"))

@@ -60,10 +60,10 @@ def test_a_small_difference_is_told_to_be_small():
     assert (small.outcome, small.verdict) == ("decided, small", "with is better, by less than would matter")
 
 
-def test_no_difference_is_a_null_and_says_how_sure_it_is():
+def test_no_difference_is_equality_and_says_how_sure_it_is():
     same = errors(0.7)
     found = held(CONTRAST, **{"with": scores(same, blocks=60), "without": scores(same, blocks=60)})
-    assert found.verdict == "null: any difference is smaller than would matter"
+    assert found.verdict == f"equal (within {CONTRAST.min_effect:g}): any difference is smaller than would matter"
     assert found.p_exact == 1.0
     few = errors(0.7, 40)
     unsure = held(CONTRAST, **{"with": scores(few, blocks=10), "without": scores(errors(0.7, 40, seed=9), blocks=10)})
@@ -194,7 +194,7 @@ def test_rejectors_are_compared_by_the_area_under_risk_against_coverage():
     assert found.difference < found.hi < 0
     assert found.verdict == "mine x logistic is better, by as much as matters"
     same = held(replace(contrast, first="mine x margin"), judged)
-    assert same.outcome == "null"
+    assert same.outcome == "equal"
 
 
 def test_an_area_that_is_not_defined_decides_nothing_and_loosens_no_other_test():

@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sasgeo_bench.boards.board_tables import Book, summary, use_table
+from sasgeo_bench.boards.board_tables import Book, use_table
 from sasgeo_bench.boards.manifests import BoardManifest
+from sasgeo_bench.boards.overview import overviews_of
 from sasgeo_bench.boards.tables import text_of
 from sasgeo_bench.boards.text import MARKDOWN, Contents, board_latex, board_markdown, rows_of, warnings_of
 from sasgeo_bench.core.errors import MetricError
@@ -340,14 +341,15 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     latex = board_latex(ABOUT, Contents(leaderboard=board))
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
     assert "success_25m" not in latex.replace(r"\_", "~")
-    (short,) = summary(Book.of(board))
-    assert short.title.startswith("success_25m [95 %] (rank), localization, searched: disc of 500 m")
-    one, none = wilson(1, 4), wilson(0, 4)
-    expected = [f"0.250 [{one.lo:.2f}, {one.hi:.2f}] (-)", f"0.000 [0.00, {none.hi:.2f}] (control)"]
+    (short,) = (item.shown for item in overviews_of(Book.of(board)))
+    assert short.title.startswith(
+        "Too few to rank (fewer than 10 queries or 3 places): success_25m [95 %], localization, searched: disc of 500 m"
+    )
+    none = wilson(0, 4)
     assert [column.name for column in short.columns] == ["matcher", "occlusion"]
-    shown = [text_of(row.cells[1]) for row in short.rows]
-    assert shown[:2] == ["4", expected[1]]  # queries and controls stand above
-    assert shown[2].endswith("] (-)")
+    shown = [text_of(row.cells[1]) for row in short.rows]  # queries stand above, controls below
+    assert (shown[0], shown[2]) == ("4", f"0.000 [0.00, {none.hi:.2f}] (control)")
+    assert re.fullmatch(r"0\.250 \[0\.\d\d, 0\.\d\d\]", shown[1])  # nobody is ranked
     assert f"| {none.value:.3f} [0.000, {none.hi:.3f}]† |" in text
     assert len(warnings_of(board)) == 2
 
@@ -356,9 +358,9 @@ def test_the_head_of_a_suite_counts_the_queries_of_its_figures_whoever_does_not_
     values = {"role": ["stress", "control"] * 4}
     able = scores([1.0, 99.0] * 4, **values)
     board = leaderboard({"able": able, "not": scores([math.inf] * 8, status="not applicable", **values)}, draws=200)
-    (short,) = summary(Book.of(board))
+    (short,) = (item.shown for item in overviews_of(Book.of(board)))
     assert short.rows[0].cells[1].text == "4"
-    (alone,) = summary(Book.of(board[board["matcher"] == "not"]))
+    (alone,) = (item.shown for item in overviews_of(Book.of(board[board["matcher"] == "not"])))
     assert alone.rows[0].cells[1].text == "8"
 
 
@@ -367,9 +369,9 @@ def test_two_versions_of_a_control_are_controls_both():
     board = leaderboard({name: scores([1.0, 99.0] * 10, blocks=6) for name in names}, draws=200)
     found = {name: ranks(pick(board, name, "success_25m")) for name in names}
     assert found == {names[0]: (None, None), names[1]: (None, None), "mine": (1, 1)}
-    (short,) = summary(Book.of(board))
+    (short,) = (item.shown for item in overviews_of(Book.of(board)))
     shown = [text_of(row.cells[1]).partition("] ")[2] for row in short.rows[1:]]
-    assert shown == ["(control)", "(control)", "(1)"]
+    assert shown == ["(1)", "(control)", "(control)"]
 
 
 def test_no_name_breaks_a_table():
@@ -431,7 +433,7 @@ def test_of_candidates_a_board_says_what_guessing_is_worth():
     board = leaderboard({"mine": scores([math.nan] * 4, track="retrieval", pool=[10, 10, 50, 50], **found)}, draws=200)
     assert pick(board, "mine", "chance_1")["value"] == pytest.approx((0.1 + 0.02) / 2)
     assert "chance 0.060 (n = 4)" in board_markdown(ABOUT, Contents(leaderboard=board))
-    (short,) = summary(Book.of(board))
+    (short,) = (item.shown for item in overviews_of(Book.of(board)))
     heads = [[cell.text for cell in row.cells] for row in short.rows if row.tone == "head"]
     assert heads == [["queries", "4"], ["chance", "0.060"]]
 

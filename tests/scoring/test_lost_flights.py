@@ -60,7 +60,11 @@ def test_losses_are_counted_over_what_was_flown_and_none_leaves_room_for_three()
     ("board", "suite", "fault"),
     [
         ("nowhere", "flight-real-age", "nowhere/scores.parquet cannot be read"),
-        ("docs/results/modules", "flight-real-age", "no flights of suite 'flight-real-age': it has no suite of flights"),
+        (
+            "docs/results/modules",
+            "flight-real-age",
+            "no flights of suite 'flight-real-age': it has no suite of flights",
+        ),
         ("docs/results/countries", "flight-gap", "no flights of suite 'flight-gap': it has flight-real-age"),
     ],
 )

@@ -45,7 +45,18 @@ _TAKEN: Final = frozenset(
         *("pooch", "psutil", "pyarrow", "pydantic", "pymavlink", "pyogrio", "pyproj", "pyulog", "rasterio", "rich"),
         *("rosbags", "scipy", "shapely", "tifffile", "torch", "tqdm", "typer", "click"),
         *("dask", "distributed", "fsspec", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
-        *("hatchling", "hypothesis", "jinja2", "mlcroissant", "pip", "pystac", "pytest", "rio_cogeo", "setuptools"),
+        *(
+            "hatchling",
+            "huggingface_hub",
+            "hypothesis",
+            "jinja2",
+            "mlcroissant",
+            "pip",
+            "pystac",
+            "pytest",
+            "rio_cogeo",
+            "setuptools",
+        ),
         *("src", "test", "tests", "con", "nul", "aux", "prn"),
     }
 )

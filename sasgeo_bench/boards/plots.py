@@ -563,6 +563,7 @@ def draw_risk(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Fi
             chart.set_xlim(0.0, 1.0)
             chart.set_xticks(HALVES)
             chart.set_ylim(0.0, max(high, 0.02))
+            chart.locator_params(axis="y", nbins=4)  # whatever the height, so that labels keep the width that is left
             chart.grid(visible=True, color=FAINT, lw=0.6)
             label_outer(chart, number, columns, len(cells), "risk (share of accepted)")
     return figure_of(charts[0][0])

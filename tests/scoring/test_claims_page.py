@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from benchmarks.claims import GOALS, apart, contrasts, goals, listed, points, scenes, steps, suites, verdict
+from benchmarks.claims import GOALS, apart, claims, contrasts, goals, listed, points, scenes, steps, suites, verdict
 from sasgeo_bench.boards.board import read_board
 from sasgeo_bench.scoring.compare import Finding
 
@@ -27,7 +27,7 @@ def found(**changes):
     ("changes", "word"),
     [
         ({"difference": 0.2, "lo": 0.1, "hi": 0.3}, "yes"),
-        ({"difference": 0.2, "lo": 0.1, "hi": 0.3, "gains_without_stress": True}, "yes"),
+        ({"difference": 0.2, "lo": 0.1, "hi": 0.3, "gains_without_stress": True}, "yes, without the stress, too"),
         ({"difference": -0.2, "lo": -0.3, "hi": -0.1}, "no: the second is better"),
         ({"difference": 0.02, "lo": 0.01, "hi": 0.025}, "smaller than matters"),
         ({"difference": 0.0, "lo": -0.02, "hi": 0.02, "p_holm": 1.0}, "equal within 3 points"),
@@ -41,7 +41,7 @@ def test_verdicts_are_those_of_the_board_in_words(changes, word):
 
 
 def test_each_contrast_has_a_row_with_the_interval_that_decides(board):
-    lines = contrasts([board])
+    lines = contrasts(board)
     assert len(lines) == 2 + len(board.findings)
     for line, row in zip(lines[2:], board.contrasts.to_dict("records"), strict=True):
         far = "" if pd.isna(row["lo_countries"]) else "_countries"
@@ -77,3 +77,11 @@ def test_what_is_found_is_listed_and_what_is_listed_is_no_less(board):
     pairs = [tuple(map(float, cell.split(","))) for row in rows for cell in row.split("|")[3:-1] if "." in cell]
     assert len(pairs) > 5
     assert all(there >= right for there, right in pairs)
+
+
+def test_a_claim_has_the_verdict_of_its_contrast_and_none_without_its_board(board):
+    assert len(claims({})) == 2
+    _, _, *rows = claims({"modules": board})
+    (junctions,) = [row for row in rows if "junctions" in row]
+    assert "| **yes** | 105, 31 (8) | +29.5 [16.7, 42.1] | `modules` |" in junctions
+    assert sum("not decided" in row for row in rows) == 5

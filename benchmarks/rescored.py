@@ -17,6 +17,7 @@ from typing import Final
 import pandas as pd
 
 from sasgeo_bench.cli.boards import score
+from sasgeo_bench.core.errors import SasgeoError
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results"
 # Of contrasts: ends and verdicts hang on draws
@@ -55,8 +56,11 @@ def main() -> int:
     asked = parser.parse_args()
     found = 0
     for stored in asked.boards or sorted(path.parent for path in RESULTS.glob("*/pack.json")):
-        with tempfile.TemporaryDirectory() as scratch:
-            lines = rescored(stored, Path(scratch), draws=asked.draws)
+        try:
+            with tempfile.TemporaryDirectory() as scratch:
+                lines = rescored(stored, Path(scratch), draws=asked.draws)
+        except SasgeoError as error:
+            parser.error(str(error))
         print(f"{stored.name}: {f'{len(lines)} differ' if lines else 'as stored'}", *lines[:20], sep="\n  ", flush=True)
         found += len(lines)
     return 1 if found else 0

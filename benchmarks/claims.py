@@ -21,6 +21,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
+from sasgeo_bench.boards.archive_file import is_pack
 from sasgeo_bench.boards.board import Board, read_board
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.scoring.compare import Finding
@@ -343,7 +344,7 @@ def tables(boards: Sequence[Board]) -> dict[str, list[str]]:
         "suites": suites(first),
         "goals": goals(first),
         **{suite: steps(first, suite) for suite in ("clean", "real-age") if suite in there},
-        "listed": listed(first, named),
+        **({"listed": listed(first, named)} if is_pack(first.folder) else {}),
         "scenes": scenes(first, named),
         "apart": apart(first),
     }

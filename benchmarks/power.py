@@ -168,6 +168,8 @@ def main() -> None:
     parser.add_argument("--split", default="world", help="split whose test places the experiment asks")
     parser.add_argument("--sites", type=int, default=1, help="how many times the sites of the pilot are asked")
     asked = parser.parse_args()
+    if asked.sites < 1:
+        parser.error(f"--sites must be at least 1, got {asked.sites}")
     contrasts = json.loads((asked.board / "board.json").read_text(encoding="utf-8"))["contrasts"]
     scores = pd.read_parquet(asked.board / "scores.parquet")
     try:

@@ -17,8 +17,11 @@ from typing import Final
 import pandas as pd
 
 from sasgeo_bench.cli.boards import score
+from sasgeo_bench.core.errors import SasgeoError
 
 RESULTS: Final = Path(__file__).parents[1] / "docs" / "results"
+# Of contrasts: ends and verdicts hang on draws
+FOUND: Final = ["name", "n", "places", "first_value", "second_value", "difference", "first_only", "second_only"]
 KEYS: Final = ["matcher", "rejector", "suite", "track", "prior_group", "stratum", "metric"]
 
 
@@ -28,16 +31,21 @@ def rescored(stored: Path, out: Path, *, draws: int = 100) -> list[str]:
 
 
 def differences(stored: Path, again: Path) -> list[str]:
-    """Return a line for each figure, and each column of scored answers, that a board lacks or has otherwise."""
+    """Return a line for each figure, and each column of answers and contrasts, that a board lacks or has otherwise."""
     old, new = (pd.read_parquet(folder / "leaderboard.parquet").set_index(KEYS)["value"] for folder in (stored, again))
     both = pd.concat({"old": old, "new": new.reindex(old.index)}, axis=1)
     differs = (both["old"] - both["new"]).abs().gt(1e-9) | (both["old"].isna() != both["new"].isna())
     figures = [
         f"{', '.join(map(str, key))}: {row['old']:.6g}, now {row['new']:.6g}" for key, row in both[differs].iterrows()
     ]
-    was, now = (pd.read_parquet(folder / "scores.parquet") for folder in (stored, again))
-    columns = [name for name in was.columns if name not in now or not was[name].equals(now[name])]
-    return figures + [f"column {name} of scores.parquet" for name in columns]
+    found = []
+    for table, compared in (("scores", None), ("contrasts", FOUND)):
+        was, now = (pd.read_parquet(folder / f"{table}.parquet") for folder in (stored, again))
+        names = list(was.columns) if compared is None else compared
+        found += [
+            f"column {name} of {table}.parquet" for name in names if name not in now or not was[name].equals(now[name])
+        ]
+    return figures + found
 
 
 def main() -> int:
@@ -48,8 +56,11 @@ def main() -> int:
     asked = parser.parse_args()
     found = 0
     for stored in asked.boards or sorted(path.parent for path in RESULTS.glob("*/pack.json")):
-        with tempfile.TemporaryDirectory() as scratch:
-            lines = rescored(stored, Path(scratch), draws=asked.draws)
+        try:
+            with tempfile.TemporaryDirectory() as scratch:
+                lines = rescored(stored, Path(scratch), draws=asked.draws)
+        except SasgeoError as error:
+            parser.error(str(error))
         print(f"{stored.name}: {f'{len(lines)} differ' if lines else 'as stored'}", *lines[:20], sep="\n  ", flush=True)
         found += len(lines)
     return 1 if found else 0

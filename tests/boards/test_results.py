@@ -46,15 +46,14 @@ def test_a_stored_board_is_scored_again_alike(tmp_path):
 
 
 def test_a_board_that_says_something_else_is_found(tmp_path):
-    stored = RESULTS / "systems-pictures"
-    for name in ("leaderboard", "scores"):
+    stored = RESULTS / "modules"
+    for name, column in (("leaderboard", "value"), ("scores", "position_error_m"), ("contrasts", "difference")):
         table = pd.read_parquet(stored / f"{name}.parquet")
-        column = "value" if name == "leaderboard" else "position_error_m"
         table.loc[table[column].first_valid_index(), column] += 0.01
         table.to_parquet(tmp_path / f"{name}.parquet")
-    figure, column = differences(stored, tmp_path)
+    figure, *columns = differences(stored, tmp_path)
     assert ", now " in figure
-    assert column == "column position_error_m of scores.parquet"
+    assert columns == ["column position_error_m of scores.parquet", "column difference of contrasts.parquet"]
 
 
 def test_results_are_small():

@@ -1,12 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of the page of claims: they say what the boards say, and what was not asked is no row."""
 
+import shutil
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
-from benchmarks.claims import GOALS, apart, claims, contrasts, goals, listed, points, scenes, steps, suites, verdict
+from benchmarks.claims import (
+    GOALS,
+    apart,
+    claims,
+    contrasts,
+    goals,
+    listed,
+    points,
+    scenes,
+    steps,
+    suites,
+    tables,
+    verdict,
+)
 from sasgeo_bench.boards.board import read_board
 from sasgeo_bench.scoring.compare import Finding
 
@@ -85,3 +99,9 @@ def test_a_claim_has_the_verdict_of_its_contrast_and_none_without_its_board(boar
     (junctions,) = [row for row in rows if "junctions" in row]
     assert "| **yes** | 105, 31 (8) | +29.5 [16.7, 42.1] | `modules` |" in junctions
     assert sum("not decided" in row for row in rows) == 5
+
+
+def test_a_board_without_answers_has_all_tables_but_that_of_what_is_listed(board, tmp_path):
+    copy = tmp_path / "modules"
+    shutil.copytree(MODULES, copy, ignore=shutil.ignore_patterns("pack.json", "predictions.parquet"))
+    assert set(tables([board])) - set(tables([read_board(copy)])) == {"listed"}

@@ -5,6 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks import power
 from benchmarks.power import Asked, ends, likeness, line, outcome, ranked_places, simulated, swapped
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 
@@ -91,3 +92,10 @@ def test_a_row_of_a_pilot_in_which_one_side_always_wins():
     assert of_one == "| all | 3, 1 | - | | | | | | |"
     assert of_one.count("|") == found.count("|")
     assert found == "| all | 12, 4 | +100.0 | 249, 83 (27) | 1.00, 1.00 | 0.00, 0.00 | 0.00 | 1.00 | 0.00 |"
+
+
+def test_no_sites_are_refused_in_a_line(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["power", "nowhere", "--sites", "0"])
+    with pytest.raises(SystemExit):
+        power.main()
+    assert "--sites must be at least 1, got 0" in capsys.readouterr().err

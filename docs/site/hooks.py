@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What MkDocs calls: pages made from the code, documents from outside docs/, links between them, the notebook."""
+"""What MkDocs calls: pages made from the code, boards, documents from outside docs/, links between them, notebooks."""
 
 import os
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+import boards
 import notebook
 import reference
 from mkdocs.config.defaults import MkDocsConfig
@@ -27,23 +29,23 @@ _LINK: Final = re.compile(r"\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]+)(#[^)\s]*)?
 _FOREIGN: Final = re.compile(
     r"<(?:script|img|iframe|link(?![^>]*rel=.?canonical))\b[^>]*(?:src|href)=.?(https?://[^\"'\s>]+)"
 )
+_TABLES: Final = re.compile(r"^results/([\w-]+)/leaderboard\.md$")
 _FENCE: Final = re.compile(r"^(```.*?^```$)", re.MULTILINE | re.DOTALL)
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """Put the pages of each folder of the navigation in its place."""
-    pages = sorted(
-        {*reference.pages(), *_written(), "decisions/index.md"}, key=lambda page: (not page.endswith("index.md"), page)
-    )
+    pages = sorted({*_made(), *_written()}, key=lambda page: (not page.endswith("index.md"), page))
     config.nav = list(_spread(config.nav, pages))
     return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are made from code, the notebook, and the documents from outside docs/."""
-    for path, text in reference.pages().items():
+    """Add the pages that are made from code, sites of boards, notebooks, and the documents from outside docs/."""
+    for path, text in _made().items():
         files.append(File.generated(config, path, content=text))
-    files.append(File.generated(config, "decisions/index.md", content=_decisions()))
+    for path, data in boards.sites():
+        files.append(File.generated(config, path, content=data))
     for path, page in OUTSIDE.items():
         files.append(File.generated(config, page, content=(ROOT / path).read_text(encoding="utf-8")))
     for path, content in notebook.pages(ROOT / "docs" / "notebooks", ROOT / "out").items():
@@ -54,7 +56,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Lead links to pages and pictures of the site; what is in the repository alone becomes text with its path.
 
-    Pages outside the menu are left out of the search.
+    Links to the tables of a stored board lead to its site. Pages outside the menu are left out of the search.
     """
     sources = {page: path for path, page in OUTSIDE.items()}
     own = page.file.src_uri
@@ -73,6 +75,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             uri += "/index.md"
         elif uri.startswith("notebooks/"):
             uri = uri.removesuffix(".py") + ".md"
+        uri = _TABLES.sub(lambda board: f"{boards.site_of(board[1])}/index.html", uri)
         found = files.get_file_from_path(uri)
         if found is not None and not found.inclusion.is_excluded():
             return f"[{text}]({os.path.relpath(uri, Path(own).parent)}{anchor})"
@@ -90,6 +93,12 @@ def on_post_build(config: MkDocsConfig) -> None:
         found = _FOREIGN.search(path.read_text(encoding="utf-8"))
         if found:
             raise PluginError(f"{path.relative_to(config.site_dir)} asks another host for {found[1]}")
+
+
+@cache
+def _made() -> dict[str, str]:
+    """Pages that are made from code and stored results, by path."""
+    return {**reference.pages(), boards.PAGE: boards.page(reference.table), "decisions/index.md": _decisions()}
 
 
 def _written() -> Iterator[str]:

@@ -1,35 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reference pages made from the code: public names, commands, metrics and columns, files, suites, methods, boards."""
+"""Reference pages made from the code: public names, commands, metrics and columns, files, suites, methods."""
 
 import ast
 import inspect
-import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import resources
-from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
 import typer
 from pydantic import BaseModel
 
-from sasgeo_bench.boards.board_files import BOARD, SCHEMAS
+from sasgeo_bench.boards.board_files import SCHEMAS
 from sasgeo_bench.boards.pipeline_spec import (
     ContrastSpec,
     LearningSpec,
     PaperSpec,
     PipelineFile,
     TaskSpec,
-    find_pipeline_file,
-    read_pipeline_file,
 )
 from sasgeo_bench.boards.tables import MARKS, MEANINGS, TERMS
 from sasgeo_bench.cli import program
-from sasgeo_bench.core.parquet import read_frame
 from sasgeo_bench.core.plugins import MATCHERS, REJECTORS, SEGMENTERS, list_entry_points
-from sasgeo_bench.core.progress import duration_text
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import Card, Submission
@@ -38,18 +32,16 @@ from sasgeo_bench.osm.locate import Extract, TownEntry
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES
-from sasgeo_bench.regions.region import DATA_VERSION, Manifest, Provenance
-from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
+from sasgeo_bench.regions.region import Manifest, Provenance
+from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.running.prediction_files import PART_SCHEMA
 from sasgeo_bench.scoring.metric import CostMetric, MeanMetric, Metric, QuantileMetric, RejectionMetric, ThresholdMetric
 from sasgeo_bench.scoring.metrics import METRICS, TRACKS
-from sasgeo_bench.scoring.rows import is_unranked
-from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, Query, Truth, base_of
+from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.split import Place, SplitFile
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks.task_files import FILE_SCHEMA, TRUTH_SCHEMA, TaskManifest
 
-RESULTS: Final = Path(__file__).parents[1] / "results"  # stored boards
 # Headings of the API pages, by the folder that a public name comes from.
 STAGES: Final = {
     "cli": "Stages as functions",
@@ -113,7 +105,6 @@ def pages() -> dict[str, str]:
         "reference/suites.md": "\n".join(_suites()),
         "reference/methods.md": "\n".join(_methods()),
         "reference/classes.md": "\n".join(_classes()),
-        "reference/boards.md": "\n".join(_boards()),
     }
 
 
@@ -394,63 +385,3 @@ def _classes() -> Iterator[str]:
             for item in load_taxonomy().classes
         ),
     )
-
-
-_ENTERING: Final = """
-What entering each takes, fewest queries first, from what is stored with it. **Begin with `systems-objects`**: the
-fewest views of real places that need no segmenter. Where nothing can be downloaded begin with [the board of the
-demo](../howto/submission.md#practise).
-
-```bash
-sasgeo-bench enter docs/results/systems-objects --matcher my-matcher --dry-run  # minutes on this machine
-```
-
-*Asking* is from the quickest ranked row of the board to the slowest, at its mean time for a query; drawing the queries
-and scoring come on top. *Extracts* are those of real places, *disk* is maps and queries. *Sealed* places need the
-published seed. *Closed* boards were made on maps that this version makes otherwise: their figures stand, and only the
-version that made them can enter them. Queries of another task version than today's, {version}, that are drawn otherwise
-by now count as misses. [Submit answers](../howto/submission.md) says more.
-"""
-
-
-def _boards() -> Iterator[str]:
-    yield "# Published boards"
-    yield _ENTERING.format(version=TASK_VERSION)
-    head = ("Board", "About", "Queries", "Suites", "Places", "Asking", "Extracts", "Disk", "Sealed", "Task version")
-    rows = [_board(pack) for pack in sorted(RESULTS.glob("*/pack.json"))]
-    yield from table((*head, "Open"), sorted(rows, key=lambda row: row[2]))
-
-
-def _board(pack: Path) -> tuple[str, str, int, int, int, str, str, str, str, int, str]:
-    """Return the row of one board, from its stored tables."""
-    folder = pack.parent
-    about = json.loads((folder / BOARD).read_text(encoding="utf-8"))
-    tasks = read_frame(folder / "tasks.parquet", mend="")
-    maps = {one["id"]: one for one in map(json.loads, tasks["region_json"])}
-    drawn = list(map(json.loads, tasks["task_json"]))
-    queries = sum(sum(one["counts"].values()) for one in drawn)
-    towns = {item.file for path in list_region_files().values() for item in read_region_file(path).extract if item.town}
-    extracts = {one["extract"]["file"]: one["extract"]["bytes"] for one in maps.values()}
-    real = {name: count for name, count in extracts.items() if name not in towns}
-    bytes_on_disk = sum(part["bytes"] for one in (*maps.values(), *drawn) for part in one["files"].values())
-    title = read_pipeline_file(find_pipeline_file(about["pipeline"]["id"])).title
-    return (
-        f"[`{folder.name}`](../results/{folder.name}/leaderboard.md)",
-        title,
-        queries,
-        len({one["suite"] for one in drawn} - {CONTROLS}),
-        len({base_of(name) for name in maps}),
-        _asking(folder, queries),
-        f"{len(real)}, {sum(real.values()) / 1e6:.0f} MB" if real else "none",
-        f"{bytes_on_disk / 1e6:.0f} MB",
-        str(len(about.get("sealed", ())) or "-"),
-        int(about["task_version"]),
-        "yes" if about["data_version"] == DATA_VERSION else "closed",
-    )
-
-
-def _asking(folder: Path, queries: int) -> str:
-    """Return how long the quickest and the slowest ranked row of a board would take for so many queries."""
-    answers = read_frame(folder / "predictions.parquet", mend="")
-    means = answers[~answers["matcher"].map(is_unranked).astype(bool)].groupby("matcher")["latency_s"].mean()
-    return " to ".join(duration_text(queries * float(end)) for end in (means.min(), means.max()))

@@ -52,6 +52,7 @@ from sasgeo_bench.regions.region import MADE_UP
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.flights import FLIGHT_COLUMNS
 from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import GROUP
@@ -68,13 +69,16 @@ _OF_SCENES: Final = (
 )
 
 
-def publish(board: Path, into: Path | None = None, *, root: Path = Path("out"), jobs: int = 1) -> Written:
+def publish(
+    board: Path, into: Path | None = None, *, root: Path = Path("out"), jobs: int = 1, tables_only: bool = False
+) -> Written:
     """Make the site of a board from its folder; stored results are scored again for their figures and pictures.
 
     `into` is the folder to write, by default `site` in the board's own. Pictures of stored results, which hold no
-    views, come from regions/, tasks/ and truth/ below `root`. `jobs` counts the processes that score. Raise
-    `StoreError` if there is no sound board or the site cannot be written, and an older site then stays as it was;
-    `ConfigError` if the board is of a private seed.
+    views, come from regions/, tasks/ and truth/ below `root`. `jobs` counts the processes that score; with
+    `tables_only` nothing is scored, and the site is of the tables as they are: no pictures, files, or figures that take
+    answers. Raise `StoreError` if there is no sound board or the site cannot be written, and an older site then stays
+    as it was; `ConfigError` if the board is of a private seed.
     """
     if into is None and (board / SITE).is_symlink():
         raise StoreError(f"{board / SITE} is a link: name where it leads with --into")
@@ -84,9 +88,11 @@ def publish(board: Path, into: Path | None = None, *, root: Path = Path("out"), 
         raise StoreError(
             f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
         )
-    with held(board, target, root=root), _with_figures(board, root, jobs) as folder:
+    with held(board, target, root=root), _with_figures(board, root, jobs, tables_only=tables_only) as folder:
         with _sound(board):
             files = read_board_files(folder)
+            if tables_only:
+                files = replace(files, downloads=())
         check_public(files.board.about.private_seed, str(board))
         with _sound(board):
             scenes = _scenes(files.board)
@@ -107,9 +113,9 @@ def publish(board: Path, into: Path | None = None, *, root: Path = Path("out"), 
 
 
 @contextmanager
-def _with_figures(board: Path, root: Path, jobs: int) -> Iterator[Path]:
+def _with_figures(board: Path, root: Path, jobs: int, *, tables_only: bool) -> Iterator[Path]:
     """Yield the folder of a board with figures: stored results are scored into one that goes when the block ends."""
-    if not is_pack(board) or (board / FIGURES).is_dir():  # results of a former layout hold their figures
+    if tables_only or not is_pack(board) or (board / FIGURES).is_dir():  # results of a former layout hold their figures
         yield board
         return
     tell(f"{board}: scoring stored results again, for their figures")
@@ -178,9 +184,13 @@ def _source(files: BoardFiles, root: Path) -> SiteSource:
 
 
 def _scenes(board: Board) -> pd.DataFrame:
-    """Return success by kind of place from the board's own scored rows; empty where these do not tell."""
+    """Return success by kind of place from the board's own scored rows; empty where these do not tell.
+
+    Rows that an older version scored may lack columns of today's figures of flights.
+    """
     scores = board.scores
-    if not set(SCORED) <= set(scores):
+    of_flights = FLIGHT_COLUMNS if set(FLIGHT_COLUMNS).intersection(scores) else ()
+    if not {*SCORED, *of_flights} <= set(scores):
         return pd.DataFrame()
     apart = {entry.name for entry in board.about.entries if entry.set_apart}
     return scene_frame(by_entry(scores), draws=board.about.draws or DRAWS, excluded=apart)

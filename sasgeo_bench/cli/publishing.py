@@ -40,6 +40,14 @@ class PublishOptions(Options):
         ),
     ] = None
     jobs: Annotated[int, typer.Option(min=1, help="processes that score stored results")] = 1
+    tables_only: Annotated[
+        bool,
+        typer.Option(
+            "--tables-only",
+            help="score nothing: a site of the tables as they are, in seconds, without the figures that take answers, "
+            "pictures and files",
+        ),
+    ] = False
     out: Out = Path("out")
 
 
@@ -83,7 +91,8 @@ def _published(options: PublishOptions) -> tuple[Written, Board | None]:
         folder = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
         scored = with_submissions(options.board, options.submissions, folder, root=options.out, jobs=options.jobs)
         board = scored.board
-    return build.publish(folder, options.into, root=options.out, jobs=options.jobs), board
+    site = build.publish(folder, options.into, root=options.out, jobs=options.jobs, tables_only=options.tables_only)
+    return site, board
 
 
 def publish_command(options: PublishOptions) -> None:

@@ -13,8 +13,10 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 
+from sasgeo_bench.boards import publish as build
 from sasgeo_bench.boards import site_files
 from sasgeo_bench.boards.board_files import check_board
 from sasgeo_bench.boards.publish import publish
@@ -294,6 +296,39 @@ def test_stored_results_make_the_same_pages(board, site, tmp_path):
         path.unlink()
     publish(stored)
     assert contents(stored / "site") == contents(site)
+
+
+def test_a_site_of_tables_alone_scores_nothing_and_says_what_it_lacks(tmp_path, monkeypatch):
+    stored = Path("docs/results/systems-objects").absolute()
+    monkeypatch.setattr(build, "score_all", None)
+    folder = publish(stored, tmp_path / "site", tables_only=True).folder
+    held = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert {name for name in held if name.startswith(("files/", "pictures/", "figures/"))} == {
+        *("figures/ageing-rates.svg", "figures/first-times.svg", "figures/places.svg", "files/kinds-of-place.csv")
+    }
+    index = Reader((folder / "index.html").read_text(encoding="utf-8"))
+    (line,) = [text for text in index.said("p") if text.startswith("This site is of tables alone.")]
+    assert "sasgeo-bench publish --board FOLDER makes one with files, figures" in line
+    assert "0.768" in " ".join(index.said("table"))
+
+
+def test_rows_that_an_older_version_scored_have_a_site_without_kinds_of_place(tmp_path):
+    stored = Path("docs/results/countries").absolute()  # of before `nees_in_band`
+    assert "nees_in_band" not in pq.read_schema(stored / "scores.parquet").names
+    folder = publish(stored, tmp_path / "site", tables_only=True).folder
+    assert not (folder / "kinds-of-place.html").exists()
+
+
+def test_every_table_and_figure_can_be_linked(pages):
+    for page in pages.values():
+        ids = {each["id"] for _, each in page.found if "id" in each}
+        own = [each["href"] for _, each in page.found if each.get("class") == "here"]
+        assert {address.removeprefix("#") for address in own} <= ids
+        assert {each["aria-labelledby"] for tag, each in page.found if tag == "table" and len(each) > 1} <= ids
+    for name in ("index.html", "suite-real-age.html", "matchers.html", "figures.html"):
+        assert any(each.get("class") == "here" for _, each in pages[name].found), name
+    (figure,) = [each["id"] for tag, each in pages["figures.html"].found if tag == "figure"]
+    assert figure == "age-real-age-localization-r500-weak-s3"
 
 
 @pytest.mark.usefixtures("plain_site")

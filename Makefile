@@ -68,7 +68,7 @@ queries: $(STAMP) ## draw every suite on the towns, and on each real region whos
 	  $(if $(EXTRACTS),--extracts "$(EXTRACTS)") --out $(OUT) $(ARGS)
 
 leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, or a file; goes on where it was cut off
-	$(SASGEO) leaderboard $(or $(PIPELINE),modules) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") \
+	$(SASGEO) leaderboard $(or $(PIPELINE),places) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") \
 	  $(if $(RESULTS),--results "$(RESULTS)") --out $(OUT) $(ARGS)
 
 # Three workers for two processors: now and then a test waits for a process that it has started.

@@ -22,15 +22,20 @@ interval by places. A risk that none is accepted to tell is `-`.
 """
 
 import argparse
+import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
 
+from sasgeo_bench.boards.archive import laid_out, request_of
 from sasgeo_bench.boards.archive_file import read_stored_predictions
 from sasgeo_bench.boards.board_files import read_board_manifest, read_scores
+from sasgeo_bench.boards.score import score_board
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.plugins import rejector_maker
@@ -149,6 +154,19 @@ def cell(found: BoardInterval) -> str:
     return "-" if np.isnan(found.value) else f"{found.value:.2f} [{found.lo:.2f}, {found.hi:.2f}]"
 
 
+def rows_of(board: Path, split: Split) -> pd.DataFrame:
+    """Return the scored rows of a board; where those of calibration places are not stored, they are scored again."""
+    scores = read_scores(board)
+    if all(turn.calibration.any() for turn in turns(scores, split, is_taught=False)):
+        return scores
+    print("the board stores no rows of calibration places: scoring its answers again", file=sys.stderr)
+    with TemporaryDirectory() as scratch:
+        request = request_of([board], board=Path(scratch) / board.name, root=Path(scratch))
+        with laid_out(replace(request, rejectors=(), contrasts=(), draws=DRAWS)) as laid:
+            scored = score_board(laid)
+    return pd.concat([frame.assign(matcher=name) for name, frame in scored.with_calibration.items()], ignore_index=True)
+
+
 def lines(words: argparse.Namespace) -> list[str]:
     """Return the table of what `parsed` returns, a line for each matcher and rejector of the board.
 
@@ -158,7 +176,8 @@ def lines(words: argparse.Namespace) -> list[str]:
         If the folder holds no board with such answers, or it is damaged.
     """
     about = read_board_manifest(words.board)
-    scores, split = read_scores(words.board), find_split(about.split or "crossfit")
+    split = find_split(about.split or "crossfit")
+    scores = rows_of(words.board, split)
     taught = {entry.name: bool(entry.learned) for entry in about.entries}
     chosen = scores["suite"].isin(SUITES) & (scores["track"] == "localization") & (scores["prior_group"] == PRIOR)
     found = [f"| matcher | rejector | {' | '.join(COLUMNS)} |", "|---|---|" + "---:|" * len(COLUMNS)]

@@ -39,7 +39,9 @@ from sasgeo_bench.tasks.query import BY, SEQUENCE
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
 ROOT = Path(__file__).parents[1]
-BOARDS = ("modules", "systems", "systems-objects", "flights", "pictures", "aerial", "aerial-soft")  # in docs/results
+BOARDS = (  # in docs/results
+    *("places", "modules", "systems", "systems-objects", "flights", "pictures", "aerial", "aerial-soft"),
+)
 PAGE = ROOT / "docs" / "unsolved.md"
 STORED = ROOT / "sasgeo_bench" / "boards" / FILE
 BEGIN, END = "<!-- made by benchmarks/unsolved.py -->\n", "<!-- end -->\n"

@@ -559,6 +559,10 @@ def _controls(chart: Axes, rows: pd.DataFrame, keys: Sequence[Line2D]) -> None:
         chart.plot(mine["latency_s"], mine["value"], color=_CONTROL, marker=key.get_marker(), ms=6, ls="", zorder=1)
 
 
+_SHOWN: Final = ("decided", "cause open", "decided, small")
+_EQUAL: Final = ("equal", "null")  # boards of before version 6 have the latter
+
+
 def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
     """Draw the difference of each registered contrast with its 95 % interval, in the order of the table.
 
@@ -573,9 +577,9 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
     about = BoardPage(
         title="Registered contrasts",
         note=(
-            "First less second on the same queries, with its 95 % interval by places. Blue: decided; grey: all "
-            "else, also where the interval leaves out 0 and the test, adjusted by Holm, does not. Grey band: "
-            "differences smaller than was registered to matter; an interval within it rules out those that do."
+            "First less second on the same queries, with its 95 % interval by countries where they are enough, else by "
+            "places. Blue: a difference is shown, adjusted by Holm; orange: equal, the interval is within the grey "
+            "band of differences that were registered not to matter; grey: not decided."
         ),
         below="difference (shares; of other metrics in their unit)",
         panel_inches=(4.6, 0.4 + max(0.28, 0.15 * lines) * len(rows)),
@@ -584,8 +588,11 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
         chart = charts[0][0]
         for at, row in enumerate(rows):
             chart.barh(at, 2 * row["least"], left=-row["least"], height=0.8, color="#eeeeee")
-            colour = look_of(1).colour if row["outcome"] == "decided" else "#999999"
-            chart.hlines(at, row["lo"], row["hi"], color=colour, lw=1.6)
+            known = [
+                look_of(number).colour for number, some in enumerate((_SHOWN, _EQUAL), 1) if row["outcome"] in some
+            ]
+            colour, by = (known or ["#999999"])[0], "" if math.isnan(row["lo_countries"]) else "_countries"
+            chart.hlines(at, row[f"lo{by}"], row[f"hi{by}"], color=colour, lw=1.6)
             chart.plot(row["difference"], at, marker="s", color=colour, ms=4.5, ls="")
         chart.axvline(0.0, color="#000000", lw=0.8)
         chart.set_yticks(range(len(rows)), labels)

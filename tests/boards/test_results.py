@@ -10,9 +10,12 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
+from benchmarks import absent_places
+from benchmarks.claims import tables
 from benchmarks.rescored import differences, rescored
 from sasgeo_bench.boards.archive import stored_settings
 from sasgeo_bench.boards.archive_file import MOST_BYTES
+from sasgeo_bench.boards.board import read_board
 from sasgeo_bench.boards.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.scoring.segmenter_board import SegmenterBoard, page_tables, with_tables
 from sasgeo_bench.tasks.query import PUBLISHED
@@ -107,12 +110,37 @@ def table_of_systems():
     return set(program["lines"](*program["read_board"](RESULTS / "systems")))
 
 
+@pytest.fixture(scope="module")
+def tables_of_claims():
+    """The lines that the program of the pages of claims and of the experiment on places prints of its boards."""
+    boards = [read_board(RESULTS / name) for name in ("places", "places-silent", "modules", "flights")]
+    return {line for lines in tables(boards).values() for line in lines}
+
+
+OF_ABSENT = re.compile(r"\| (matcher \| rejector|sasgeo|schmidt_segcorr) \|")  # rows of `benchmarks.absent_places`
+
+
+def test_the_rows_of_the_page_of_claims_are_those_of_the_boards(tables_of_claims):
+    rows = [row for name in ("README", "places") for row in ROW.findall(TEXTS[RESULTS / f"{name}.md"])]
+    figures = [row for row in rows if not row.startswith(("| | |", "|:--", "| [")) and not OF_ABSENT.match(row)]
+    assert len(figures) > 60
+    assert [row for row in figures if row not in tables_of_claims] == []
+
+
+@pytest.mark.slow
+def test_the_rows_about_absent_places_are_those_of_their_program():
+    words = absent_places.parsed([str(RESULTS / "places"), "--matchers", "sasgeo", "schmidt_segcorr"])
+    rows = [row for row in ROW.findall(TEXTS[RESULTS / "places.md"]) if OF_ABSENT.match(row)]
+    assert len(rows) == 11
+    assert set(rows) <= set(absent_places.lines(words))
+
+
 @pytest.mark.slow
 def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures, table_of_losses, table_of_systems):
     boards = {line for path in RESULTS.glob("*/leaderboard.md") for line in path.read_text("utf-8").splitlines()}
     boards |= tables_of_pictures | table_of_losses | table_of_systems
     rows = {page.stem: ROW.findall(text) for page, text in TEXTS.items()}
-    del rows[SEGMENTERS.name], rows["README"]  # held as wholes, and figure by figure, below
+    del rows[SEGMENTERS.name], rows["README"], rows["places"]  # held as wholes, below, and above
     assert sum(map(len, rows.values())) > 100
     assert {page: [row for row in some if row not in boards] for page, some in rows.items()} == {
         page: [] for page in rows
@@ -191,7 +219,6 @@ def test_the_stored_board_of_segmenters_is_small_and_each_trial_has_a_profile(se
 @pytest.mark.parametrize(
     ("page", "board", "unsaid"),
     [
-        ("README", "modules", set()),
         ("pictures", "aerial-soft", set()),
         ("flights", "flights", set()),
     ],
@@ -211,6 +238,13 @@ def test_the_verdicts_that_the_pages_put_into_words_are_those_of_the_boards():
         board: pd.read_parquet(RESULTS / board / "contrasts.parquet").set_index("name")["outcome"] for board in BOARDS
     }
     values = {
+        "places": {
+            **dict.fromkeys(("scorer", "scorer-terms", "scorer-lure", "adaptive-lure", "rejection-natural"), "decided"),
+            **dict.fromkeys(("scorer-twins", "geometry"), "cause open"),
+            "adaptive-clean": "null",
+            **dict.fromkeys(("graph-natural", "distinct"), "not decided"),
+        },
+        "places-silent": {"unknown": "null"},
         "modules": {
             **dict.fromkeys(("graph-junctions", "graph-instances"), "decided"),
             **dict.fromkeys(("graph-levels", "graph-warp", "learned-age", "prior-age", "prior-lure"), "not decided"),

@@ -194,8 +194,10 @@ def _commands(rows: Sequence[Headroom]) -> Iterator[str]:
         mine = [row for row in rows if row.board == board]
         plugin = "my-tracker" if {row.track for row in mine} == {SEQUENCE} else "my-matcher"
         seed = Path("docs", "results", f"{board}-sealed-seed.txt")
-        sealed = f" --sealed-seed-file {seed}" if (ROOT / seed).exists() else ""
+        sealed = f" --sealed-seed-file {board}.seed" if (ROOT / seed).exists() else ""
         yield f"# {', '.join(dict.fromkeys(row.suite for row in mine))}"
+        if sealed:
+            yield f"install -m 600 {seed} {board}.seed"
         yield f"sasgeo-bench enter docs/results/{board} --matcher {plugin} --extracts ~/osm{sealed}"
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Score predictions and carry out experiments: the function and the commands."""
 
+import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -286,6 +287,9 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         tell(f"reading the cards of {counted(len(plan.matchers), 'matcher')}: a second or two each")
         say(plan.to_text())
         return
+    processors = os.cpu_count() or 1
+    if options.jobs == 1 < processors and options.dask is None:
+        tell(f"one process asks each matcher: --jobs {processors} uses the processors of this machine")
     results, private = options.results, options.private
     if plan.private is not None and (results is not None or private is not None):
         seed = SeedRecord(commitment=plan.private.commitment, bits=plan.private.bits)

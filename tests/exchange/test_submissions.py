@@ -506,13 +506,6 @@ def test_a_submission_with_a_fault_costs_nobody_the_board(copied, stored, progra
     assert "mine" not in {entry.name for entry in about.entries}
 
 
-def test_every_submission_of_the_repository_is_sound() -> None:
-    for folder in list_submissions(ROOT / "submissions"):
-        board = ROOT / "docs" / "results" / read_submission(folder).board
-        _, faults = hold_submission(folder, [board] if board.is_dir() else [])
-        assert [fault.to_text() for fault in faults if not fault.is_missing_row] == [], folder
-
-
 def test_a_submission_for_another_board_is_left_out_and_said(copied, stored, program, tmp_path):
     change_said(copied, lambda said: said.update(board="other"))
     code, out, err = program("verify", copied, "--for", stored)
@@ -699,9 +692,12 @@ def test_a_submission_that_has_the_name_of_another_entry_is_left_out(copied, sto
     assert [entry.name for entry in read_board_manifest(tmp_path / "boards" / "board").entries].count("mine") == 1
 
 
+@pytest.mark.slow
 def test_every_submission_of_the_repository_is_sound_for_its_board(program):
     root = Path(__file__).parents[2]
-    for record in sorted(root.glob("submissions/*/*/submission.json")):
+    records = sorted(root.glob("submissions/*/*/submission.json"))
+    assert len(records) >= 3
+    for record in records:
         stored = root / "docs" / "results" / record.parts[-3]
         code, _, err = program("verify", record.parent, "--for", stored)
         assert code == 0, err

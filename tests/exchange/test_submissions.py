@@ -25,7 +25,6 @@ from sasgeo_bench.core.folders import file_record
 from sasgeo_bench.core.progress import reporting
 from sasgeo_bench.exchange.submissions import (
     SubmitRequest,
-    hold_submission,
     make_submission,
     submissions_for,
     with_submissions,
@@ -37,7 +36,7 @@ from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.prediction_files import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.scoring.entries import check_submitted, find_entries
-from sasgeo_bench.scoring.submission_files import list_submissions, read_submission
+from sasgeo_bench.scoring.submission_files import read_submission
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import find_split
 from tests.threaded import threaded

@@ -693,10 +693,9 @@ def test_a_submission_that_has_the_name_of_another_entry_is_left_out(copied, sto
 
 @pytest.mark.slow
 def test_every_submission_of_the_repository_is_sound_for_its_board(program):
-    root = Path(__file__).parents[2]
-    records = sorted(root.glob("submissions/*/*/submission.json"))
+    records = sorted(ROOT.glob("submissions/*/*/submission.json"))
     assert len(records) >= 3
     for record in records:
-        stored = root / "docs" / "results" / record.parts[-3]
+        stored = ROOT / "docs" / "results" / record.parts[-3]
         code, _, err = program("verify", record.parent, "--for", stored)
         assert code == 0, err

@@ -143,7 +143,7 @@ figures: $(STAMP) ## draw docs/figures anew: EXTRACTS=<folder of the dated extra
 	@test -n "$(EXTRACTS)" || { echo "name the folder of the extracts: make figures EXTRACTS=~/osm" >&2; exit 2; }
 	$(SASGEO) build-region vaduz --extracts "$(EXTRACTS)" --out $(OUT)
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/regions/vaduz/preview.png docs/figures/region.webp
-	$(SASGEO) publish --board docs/results/modules --into $(OUT)/public
+	$(SASGEO) publish --board docs/results/places --tables-only --into $(OUT)/public
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/public/index.html docs/figures/board.webp
 
 $(DOCS_STAMP): $(STAMP) requirements-docs.lock

@@ -65,7 +65,7 @@ class Claim:
 
 CLAIMS: Final = (
     Claim(
-        "Dense geometry finds what a global description does not",
+        "Dense geometry (with the terms of version 6) finds what a global description does not",
         "places",
         "geometry",
         "a description that is more than shares of classes",
@@ -85,7 +85,10 @@ CLAIMS: Final = (
     Claim("The graph helps where views are bent", "modules", "graph-warp", "a map that bends as real ones do"),
     Claim("Distinctive configurations should weigh more (Eq. 6)", "places", "distinct", "more look-alikes"),
     Claim(
-        "Weights should follow what is seen (Eq. 11), where areas lie", "places", "adaptive-lure", "lures that exist"
+        "Overlap of areas should yield to lines that are seen (one weight of Eq. 11), where areas lie",
+        "places",
+        "adaptive-lure",
+        "lures that exist",
     ),
     Claim("- and cost nothing on clean views", "places", "adaptive-clean", "views of other errors"),
     Claim("Classes that last should weigh more, on old maps", "modules", "prior-age", "twice the places with old maps"),
@@ -96,7 +99,10 @@ CLAIMS: Final = (
         "- and where a detector is silent as real ones were", "places-silent", "unknown", "silence measured elsewhere"
     ),
     Claim(
-        "More features than the margin reject better", "places", "rejection-natural", "more countries to be fitted on"
+        "More features than the margin reject better, kinds of absence pooled",
+        "places",
+        "rejection-natural",
+        "more countries to be fitted on",
     ),
     Claim("Motion makes a tracker of single views", "flights", "odometry", "flights that were flown"),
 )

@@ -32,6 +32,19 @@ FOUND: Final = "success_25m"
 TRIED: Final = ("krems", "london", "vaduz")  # the scorer was tried there before its numbers were chosen on train places
 SEARCHED: Final = ("clean", "volatile-lure")  # suites of which it is told what the search leaves to the score
 LEAST_VIEWS: Final = 20  # of a scene
+# Pairs that no contrast asks: suite, kinds of views, and the two.
+BESIDE: Final = (
+    ("natural-twins", ("N1",), SCORER, "schmidt_segcorr"),
+    ("natural-twins", ("N1 vectors",), SCORER, "schmidt_segcorr"),
+    ("natural-twins", ("N1 vectors",), SCORER, "raster_soft"),
+    ("natural-twins", ("unrivalled N1 vectors",), SCORER, "sasgeo_no_graph"),
+    ("natural-twins", ("N1 vectors", "unrivalled N1 vectors"), SCORER, "sasgeo_no_graph"),
+    ("local-warp", ("G1 rows", "G1 tilt"), SCORER, "sasgeo_no_graph"),
+    ("volatile-lure", ("S2",), SCORER, "sasgeo_even"),
+    ("clean", ("perception",), SCORER, PLAIN),
+    ("absent", ("feature-poor",), SCORER, "schmidt_segcorr"),
+    ("occlusion", ("U4 adversarial",), SCORER, "schmidt_segcorr"),
+)
 POOR: Final = 0.05  # share of a view that is mapped
 
 
@@ -256,11 +269,11 @@ def met(value: float, wanted: float) -> str:
     return "reached" if value >= wanted else "missed"
 
 
-def views(board: Board) -> pd.DataFrame:
-    """Return the views under stress of a board, with whether each was found."""
+def views(board: Board, *, unrivalled: bool = False) -> pd.DataFrame:
+    """Return the views under stress of a board, with whether each was found; `unrivalled` ones, too, if wanted."""
     scores = board.scores
     rows = scores[(scores["role"] == "stress") & scores["is_present"] & (scores["track"] == "localization")]
-    rows = rows[~rows["kind"].str.startswith("unrivalled")]
+    rows = rows if unrivalled else rows[~rows["kind"].str.startswith("unrivalled")]
     return rows.assign(found=(rows["position_error_m"] <= 25) & (rows["yaw_error_deg"] <= 5))
 
 
@@ -331,15 +344,33 @@ def apart(board: Board) -> list[str]:
             chosen = some[some["suite"].isin(contrast.suites) & some["kind"].str.startswith(contrast.kinds or "")]
             if contrast.detectors:
                 chosen = chosen[chosen["detector"].isin(contrast.detectors)]
-            chosen = chosen[chosen["matcher"].isin((found.first, found.second))]
-            both = chosen.pivot_table(index=["query_id", "place"], columns="matcher", values="found")
-            if both.shape[1] < 2:
-                cells.append("-")
-                continue
-            pair = both[[found.first, found.second]].dropna().astype(float)
+            pair = pair_of(chosen, found.first, found.second)
             gain = 100 * (pair[found.first] - pair[found.second]).mean()
-            cells.append(f"{gain:+.1f}; {len(pair)}, {pair.reset_index()['place'].nunique()}")
+            cells.append(f"{gain:+.1f}; {len(pair)}, {pair['place'].nunique()}" if len(pair) else "-")
         lines.append(f"| {found.name} | {' | '.join(cells)} |")
+    return lines
+
+
+def pair_of(rows: pd.DataFrame, first: str, second: str) -> pd.DataFrame:
+    """Return whether each of two found the views that both were asked, by query and place; empty without any."""
+    rows = rows[rows["matcher"].isin((first, second))]
+    found = rows.pivot_table(index=["query_id", "place"], columns="matcher", values="found")
+    return found.reindex(columns=[first, second]).dropna().astype(float).reset_index()
+
+
+def beside(board: Board) -> list[str]:
+    """Return the table of pairs that no contrast asks: described, without a test."""
+    lines = begun(["views of", "first", "second", "gain, points", "won, lost", "views, places"])
+    rows = views(board, unrivalled=True)
+    for suite, kinds, first, second in BESIDE:
+        pair = pair_of(rows[(rows["suite"] == suite) & rows["kind"].isin(kinds)], first, second)
+        if len(pair):
+            gain = pair[first] - pair[second]
+            lines.append(
+                f"| {suite}: {', '.join(kinds)} | `{first}`: {pair[first].mean():.3f} | `{second}`: "
+                f"{pair[second].mean():.3f} | {100 * gain.mean():+.1f} | {(gain > 0).sum()}, {(gain < 0).sum()} | "
+                f"{len(pair)}, {pair['place'].nunique()} |"
+            )
     return lines
 
 
@@ -357,6 +388,13 @@ def tables(boards: Sequence[Board]) -> dict[str, list[str]]:
         **({"listed": listed(first, named)} if is_pack(first.folder) else {}),
         "scenes": scenes(first, named),
         "apart": apart(first),
+        "beside": beside(first),
+        **{
+            f"{board.folder.name}: {name}": make(board)
+            for board in boards[1:]
+            if board.about.split == first.about.split
+            for name, make in (("contrasts", contrasts), ("apart", apart))
+        },
     }
 
 

@@ -117,6 +117,11 @@ def tables_of_claims():
     return {line for lines in tables(boards).values() for line in lines}
 
 
+def test_no_table_of_the_experiment_is_missing_on_its_pages(tables_of_claims):
+    text = "\n".join(TEXTS[RESULTS / f"{name}.md"] for name in ("README", "places"))
+    assert [line for line in tables_of_claims if line and line not in text] == []
+
+
 OF_ABSENT = re.compile(r"\| (matcher \| rejector|sasgeo|schmidt_segcorr) \|")  # rows of `benchmarks.absent_places`
 
 

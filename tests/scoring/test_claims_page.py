@@ -10,6 +10,7 @@ import pytest
 from benchmarks.claims import (
     GOALS,
     apart,
+    beside,
     claims,
     contrasts,
     goals,
@@ -105,3 +106,17 @@ def test_a_board_without_answers_has_all_tables_but_that_of_what_is_listed(board
     copy = tmp_path / "modules"
     shutil.copytree(MODULES, copy, ignore=shutil.ignore_patterns("pack.json", "predictions.parquet"))
     assert set(tables([board])) - set(tables([read_board(copy)])) == {"listed"}
+
+
+def test_pairs_that_no_contrast_asks_are_counted_view_by_view(board):
+    lines = beside(board)
+    (twins,) = [line for line in lines if line.startswith("| clean: perception")] or [""]
+    assert twins == ""  # `sasgeo_raster` was not asked there
+    (bent,) = [line for line in lines if line.startswith("| local-warp: ")]
+    rows = board.scores
+    rows = rows[rows["kind"].isin(("G1 rows", "G1 tilt")) & rows["matcher"].isin(("sasgeo", "sasgeo_no_graph"))]
+    right = rows["position_error_m"].le(25) & rows["yaw_error_deg"].le(5)
+    mine, other = (
+        set(rows.loc[right & rows["matcher"].eq(name), "query_id"]) for name in ("sasgeo", "sasgeo_no_graph")
+    )
+    assert f"| {len(mine - other)}, {len(other - mine)} | {rows['query_id'].nunique()}, " in bent

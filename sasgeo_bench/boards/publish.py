@@ -23,7 +23,7 @@ from sasgeo_bench.boards.board_files import (
     read_leaderboard,
 )
 from sasgeo_bench.boards.board_tables import Book
-from sasgeo_bench.boards.manifests import PipelineRecord
+from sasgeo_bench.boards.manifests import PicturesManifest, PipelineRecord
 from sasgeo_bench.boards.overview import overviews_of, times_frame
 from sasgeo_bench.boards.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.boards.pooled_plots import draw_tradeoff
@@ -92,7 +92,7 @@ def publish(
         with _sound(board):
             files = read_board_files(folder)
             if tables_only:
-                files = replace(files, downloads=())
+                files = replace(files, figures=(), downloads=(), pictures=PicturesManifest())
         check_public(files.board.about.private_seed, str(board))
         with _sound(board):
             scenes = _scenes(files.board)

@@ -87,6 +87,8 @@ it: name another one with --into
 def _published(options: PublishOptions) -> tuple[Written, Board | None]:
     """Score submissions, if any, with the stored results, and make the site; return it and the board of both."""
     folder, board = options.board, None
+    if options.submissions and options.tables_only:
+        raise ConfigError("--tables-only scores nothing, and --submissions have to be scored: leave one out")
     if options.submissions:
         folder = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
         scored = with_submissions(options.board, options.submissions, folder, root=options.out, jobs=options.jobs)

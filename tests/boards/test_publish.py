@@ -312,6 +312,18 @@ def test_a_site_of_tables_alone_scores_nothing_and_says_what_it_lacks(tmp_path, 
     assert "0.768" in " ".join(index.said("table"))
 
 
+def test_a_site_of_tables_alone_of_a_scored_board_has_no_figures_or_pictures_either(own, mistake):
+    folder = publish(own, own.parent / "tables", tables_only=True).folder
+    assert not (folder / "pictures").exists()
+    assert {path.name for path in (folder / "figures").iterdir()} <= {
+        "ageing-rates.svg",
+        "first-times.svg",
+        "places.svg",
+    }
+    err = mistake("publish", "--board", own, "--tables-only", "--submissions", own.parent / "submissions")
+    assert "--tables-only scores nothing, and --submissions have to be scored: leave one out" in err
+
+
 def test_rows_that_an_older_version_scored_have_a_site_without_kinds_of_place(tmp_path):
     stored = Path("docs/results/countries").absolute()  # of before `nees_in_band`
     assert "nees_in_band" not in pq.read_schema(stored / "scores.parquet").names

@@ -36,7 +36,7 @@ from sasgeo_bench.boards.archive import laid_out, request_of
 from sasgeo_bench.boards.archive_file import read_stored_predictions
 from sasgeo_bench.boards.board_files import read_board_manifest, read_scores
 from sasgeo_bench.boards.score import score_board
-from sasgeo_bench.core.errors import SasgeoError
+from sasgeo_bench.core.errors import ConfigError, SasgeoError
 from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.scoring.base import Floats
@@ -164,7 +164,10 @@ def rows_of(board: Path, split: Split) -> pd.DataFrame:
         request = request_of([board], board=Path(scratch) / board.name, root=Path(scratch))
         with laid_out(replace(request, rejectors=(), contrasts=(), draws=DRAWS)) as laid:
             scored = score_board(laid)
-    return pd.concat([frame.assign(matcher=name) for name, frame in scored.with_calibration.items()], ignore_index=True)
+    rows = pd.concat([frame.assign(matcher=name) for name, frame in scored.with_calibration.items()], ignore_index=True)
+    if not all(turn.calibration.any() for turn in turns(rows, split, is_taught=False)):
+        raise ConfigError(f"{board} asked no calibration place of {split.spec.id}: no threshold can be chosen")
+    return rows
 
 
 def lines(words: argparse.Namespace) -> list[str]:

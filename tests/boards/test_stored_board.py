@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from matplotlib.colors import to_hex
 from matplotlib.legend import Legend
 from matplotlib.text import Text
 
@@ -71,6 +72,17 @@ def test_every_contrast_with_queries_is_drawn_with_its_sides(board):
     drawn = [label.get_text() for label in chart.get_yticklabels()]
     known = board.contrasts[board.contrasts["n"] > 0]
     assert drawn == [f"{row['name']}: {row['first']} - {row['second']}" for _, row in known.iterrows()]
+
+
+def test_a_contrast_has_the_interval_that_decides_and_the_colour_of_its_verdict():
+    places = sgb.read_board(TOWNS.parent / "places")
+    (chart,) = places.plot_contrasts().axes
+    spans = [(each.get_segments()[0], to_hex(each.get_color()[0])) for each in chart.collections]
+    colours = {}
+    for (span, colour), row in zip(spans, places.contrasts.to_dict("records"), strict=True):
+        assert span[:, 0].tolist() == [row["lo_countries"], row["hi_countries"]]
+        colours.setdefault(colour, set()).add(row["outcome"])
+    assert sorted(map(sorted, colours.values())) == [["cause open", "decided"], ["not decided"], ["null"]]
 
 
 def test_risk_is_drawn_for_matchers_that_give_a_confidence(board):

@@ -5,6 +5,7 @@ Transformers of pyproj may be shared by threads since version 3.1.
 """
 
 import math
+import re
 from functools import lru_cache
 from typing import Final
 
@@ -16,12 +17,30 @@ from sasgeo_bench.geometry.pose import bearing_deg
 
 _STEP_DEG: Final = 1e-4  # to the north, by which the grid's north is found
 WGS84: Final = 4326  # EPSG code of longitude and latitude
+_OPEN_DATUM: Final = re.compile(r"^(D_)?(unknown|not[ _]specified)", re.IGNORECASE)
+_WGS84_SIZE_M: Final = 6_378_137.0  # half the longer axis of the ellipsoid
 
 
 @lru_cache(maxsize=256)
 def between(source_epsg: int, target_epsg: int) -> pyproj.Transformer:
     """Return what turns coordinates of one CRS into those of another; x or longitude comes first."""
     return pyproj.Transformer.from_crs(source_epsg, target_epsg, always_xy=True)
+
+
+def has_open_datum(crs: pyproj.CRS) -> bool:
+    """Return whether a CRS names an ellipsoid alone, which PROJ then takes for one about the centre of WGS 84.
+
+    Datums of one ellipsoid lie a hundred metres apart. Those of the size of WGS 84 lie within metres and are not open,
+    nor is a CRS that brings its own way to WGS 84 (TOWGS84).
+
+    >>> [has_open_datum(pyproj.CRS(f"+proj=utm +zone=32 +ellps={name}")) for name in ("bessel", "GRS80")]
+    [True, False]
+    """
+    while crs.is_compound:
+        crs = crs.sub_crs_list[0]
+    if crs.is_bound or crs.datum is None or crs.ellipsoid is None:
+        return False
+    return bool(_OPEN_DATUM.search(crs.datum.name)) and crs.ellipsoid.semi_major_metre != _WGS84_SIZE_M
 
 
 def from_lonlat(epsg: int) -> pyproj.Transformer:

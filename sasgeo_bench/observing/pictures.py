@@ -15,7 +15,7 @@ import rasterio
 import shapely
 from affine import Affine
 from numpy.typing import NDArray
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import CRSError, RasterioError
@@ -27,7 +27,7 @@ from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.progress import tell
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.pose import Pose, bearing_deg
-from sasgeo_bench.geometry.projection import to_grid
+from sasgeo_bench.geometry.projection import has_open_datum, to_grid
 from sasgeo_bench.regions.layers import find_bands, selected
 from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.dem import read_dem
@@ -334,6 +334,11 @@ def _georeferenced(path: Path) -> OwnPicture | None:
         with open_geotiff(path) as source:
             if source.crs is None or source.transform.is_identity:
                 return None
+            if has_open_datum(CRS.from_wkt(source.crs.to_wkt())):
+                raise ImageError(
+                    f"{path} has a coordinate system that leaves the datum open, so that it may lie a hundred metres "
+                    "off: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
+                )
             ground = _Ground.of(source)
     except RasterioError as error:
         if isinstance(error, CRSError):

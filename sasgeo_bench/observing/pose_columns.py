@@ -23,7 +23,7 @@ from sasgeo_bench.core.paths import read_bounded
 from sasgeo_bench.core.texts import message_of, plain
 from sasgeo_bench.flights.log_formats import key_of
 from sasgeo_bench.flights.log_units import UNITS, WORDS
-from sasgeo_bench.geometry.projection import WGS84
+from sasgeo_bench.geometry.projection import WGS84, has_open_datum
 from sasgeo_bench.observing.picture_poses import (
     SWAPPED,
     AltitudeOf,
@@ -172,7 +172,6 @@ _MOMENT: Final = re.compile(
 _PLAIN_UNIT: Final = re.compile(r"[\[(](?:decimal )?(?:degrees?|units?)[\])]", re.IGNORECASE)
 _LETTERS: Final = MappingProxyType({"longitude": "EW", "latitude": "NS"})
 _BODY: Final = ("yaw", "pitch", "roll")
-_OPEN_DATUM: Final = re.compile(r"^(D_)?(unknown|not[ _]specified)", re.IGNORECASE)
 _NO_PLACE, NO_NUMBER = "without a position", "whose position is no number"
 _NO_SIDE: Final = "whose position does not say N or S, E or W"
 
@@ -320,11 +319,8 @@ def epsg_of_wkt(path: Path, wkt: str) -> int | None:
 
 def epsg_of_crs(path: Path, crs: pyproj.CRS) -> int:
     """Return the EPSG code of a CRS; raise `PoseError` if it has none, or its datum is open."""
-    datum, size_m = crs.datum, math.nan if crs.ellipsoid is None else crs.ellipsoid.semi_major_metre
-    # pyproj takes any datum of the ellipsoid, a hundred metres off; those of this size are WGS 84 within metres.
-    is_open = datum is not None and _OPEN_DATUM.search(datum.name) and size_m != 6_378_137.0
     # to_2d changes axes that WKT leaves open, and the code is then no longer found
-    epsg = None if is_open else crs.to_epsg(min_confidence=70) or crs.to_2d().to_epsg(min_confidence=70)
+    epsg = None if has_open_datum(crs) else crs.to_epsg(min_confidence=70) or crs.to_2d().to_epsg(min_confidence=70)
     if epsg is None:
         raise PoseError(f"{path.name} is in {plain(crs.name)}, which has no EPSG code: export it in a CRS that has one")
     return int(epsg)
@@ -807,11 +803,9 @@ def read_geojson(path: Path, found: Mapping[str, Any], features: Sequence[Mappin
     """Return the poses of points with properties; places are those of the geometry."""
     try:
         crs = found["crs"]["properties"]["name"] if found.get("crs") else "EPSG:4326"
-        epsg = WGS84 if "CRS84" in crs else pyproj.CRS.from_user_input(crs).to_epsg()
-    except (TypeError, KeyError, CRSError):
-        epsg = None
-    if epsg is None:
-        raise PoseError(f"{path.name} states a CRS that is not known: write it by WGS 84, as GeoJSON is")
+        epsg = WGS84 if "CRS84" in crs else epsg_of_crs(path, pyproj.CRS.from_user_input(crs))
+    except (TypeError, KeyError, CRSError) as error:
+        raise PoseError(f"{path.name} states a CRS that is not known: write it by WGS 84, as GeoJSON is") from error
     is_geographic = check_crs(epsg)
     places = ("longitude", "latitude") if is_geographic else ("easting", "northing")
     barred = {"longitude", "latitude", "both", "east", "north", "latitude_ref", "longitude_ref"}

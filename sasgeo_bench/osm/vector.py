@@ -22,7 +22,7 @@ from sasgeo_bench.core.parquet import MOST_VALUES, VERIFIED, open_table, read_sc
 from sasgeo_bench.core.paths import plain_file
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.projection import WGS84, to_lonlat
+from sasgeo_bench.geometry.projection import WGS84, has_open_datum, to_lonlat
 from sasgeo_bench.osm.geojson import NO_TIME, features_of, shape_of
 from sasgeo_bench.osm.locate import ClassTable
 from sasgeo_bench.osm.mapped import lonlat_box
@@ -211,12 +211,14 @@ def _crs(path: Path, stated: str | pyproj.CRS | None, epsg: int | None) -> pypro
     crs = pyproj.CRS.from_user_input(stated) if stated is not None else asked
     if crs is not None and crs.is_compound:
         crs = crs.sub_crs_list[0]
+    if crs is not None and asked is not None and has_open_datum(crs):
+        crs = asked  # which says what the file leaves open
     if crs is None or not (crs.is_geographic or crs.is_projected):
         what = "no coordinate reference system" if crs is None else f"the local one {one_line(crs.name)[:60]!r} alone"
         if crs is None or asked is None:
             raise ExtractError(f"{path} states {what}: say which it is by epsg = ... in its [[own_map]]")
         crs = asked
-    own = crs.to_epsg()
+    own = None if has_open_datum(crs) else crs.to_epsg()
     if asked is not None and own is not None and own != asked.to_epsg():
         raise ExtractError(f"{path} states EPSG:{own}, its [[own_map]] epsg = {epsg}: leave that out, or mend the file")
     return crs.to_2d()

@@ -24,6 +24,7 @@ from sasgeo_bench.core.errors import GridError, ImageryError
 from sasgeo_bench.core.geotiff import is_database, open_geotiff
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.projection import has_open_datum
 from sasgeo_bench.regions.imagery import BANDS, ImageryEntry, PictureRecord
 from sasgeo_bench.regions.layers import RGB, Bands, find_bands, selected
 from sasgeo_bench.regions.tiles import open_tiled, open_tiles, record_of
@@ -136,6 +137,11 @@ def _check_kind(path: Path, source: rasterio.io.DatasetReader) -> None:
         raise ImageryError(
             f"{path} has the coordinate reference system {one_line(crs.name)[:60]!r}, which is neither geographic nor "
             "projected, as that of a building site: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
+        )
+    if has_open_datum(crs):
+        raise ImageryError(
+            f"{path} has the coordinate reference system {one_line(crs.name)[:60]!r}, which leaves the datum open: it "
+            "may lie a hundred metres off; write the right one into it (gdal_edit.py -a_srs EPSG:...)"
         )
     if source.width * source.height > MOST_PIXELS:
         raise ImageryError(

@@ -17,6 +17,7 @@ from sasgeo_bench.core.errors import CameraError
 from sasgeo_bench.core.geotiff import open_geotiff
 from sasgeo_bench.core.texts import one_line
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.projection import has_open_datum
 from sasgeo_bench.sensing.ground import Dem
 
 _UNITS_M: Final = dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0) | {
@@ -86,6 +87,11 @@ def _unit_m(path: Path, source: rasterio.DatasetReader) -> float:
 def _check_source(path: Path, source: rasterio.DatasetReader, epsg: int) -> None:
     if source.crs is None:
         raise CameraError(f"{path} has no CRS: write one into it (gdal_edit.py -a_srs EPSG:...), or name another file")
+    if has_open_datum(pyproj.CRS.from_wkt(source.crs.to_wkt())):
+        raise CameraError(
+            f"{path} has a coordinate reference system that leaves the datum open, so that it may lie a hundred metres "
+            "off: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
+        )
     try:
         pyproj.Transformer.from_crs(source.crs.to_wkt(), epsg)
     except ProjError as error:

@@ -289,3 +289,10 @@ def test_numbers_that_cannot_be_are_refused():
     for wrong in ({"height_m": 0.0}, {"height_m": math.nan}, {"ground_width_m": 1e9}):
         with pytest.raises(CameraError, match="is above 0 and at most"):
             replace(Told(), **wrong)
+
+
+def test_a_georeferenced_picture_that_leaves_the_datum_open_is_refused(tmp_path):
+    transform = turned(0.0, 0.6, east_m=520_000.0, north_m=5_220_000.0, size=(400, 300))
+    path = write_geotiff(tmp_path / "a.tif", transform=transform, crs="+proj=utm +zone=32 +ellps=bessel")
+    with pytest.raises(ImageError, match="leaves the datum open"):
+        open_picture(path)

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from sasgeo_bench.core.errors import PoseError
 from sasgeo_bench.observing.picture_poses import PoseFacts
 from sasgeo_bench.observing.pose_tables import read_pose_table
 from sasgeo_bench.sensing.camera import Attitude
@@ -364,3 +365,10 @@ def test_geojson_may_state_an_older_crs(read):
     point = {"type": "Point", "coordinates": [330000.0, 9083000.0]}
     (pose,) = read(collection(feature("a.jpg", point), crs=crs)).poses
     assert (pose.place, pose.epsg) == ((330000.0, 9083000.0), 32750)
+
+
+@pytest.mark.parametrize(("stated", "fault"), [("+proj=utm +zone=32 +ellps=intl", "no EPSG code"), ("EPSG:1", "known")])
+def test_geojson_in_a_crs_that_leaves_the_datum_open_or_is_none_is_refused(read, stated, fault):
+    point = {"type": "Point", "coordinates": [330000.0, 5200000.0]}
+    with pytest.raises(PoseError, match=fault):
+        read(collection(feature("a.jpg", point), crs={"type": "name", "properties": {"name": stated}}))

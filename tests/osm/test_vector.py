@@ -493,3 +493,16 @@ def test_real_labels_in_web_mercator_lie_where_their_numbers_say():
     assert shapely.hausdorff_distance(shapely.union_all(found.geometry.to_numpy()), shapely.union_all(moved)) < 0.01
     # 23.8 degrees north: metres of Web Mercator are longer than those on the ground by 1 / cos
     assert found.area.sum() == pytest.approx(sum(one.area for one in shapes) * np.cos(np.radians(23.8)) ** 2, rel=0.01)
+
+
+def test_a_file_that_leaves_the_datum_open_says_so_or_takes_that_of_the_region_file(tmp_path):
+    """PROJ takes any datum of the ellipsoid for it: DHDN, which has Bessel's, lies a hundred metres from WGS 84."""
+    stated = frame(HOUSE).to_crs(31467)
+    plain, path = tmp_path / "a.geojson", tmp_path / "a.gpkg"
+    plain.write_text(stated.geometry.to_json())
+    open_datum = pyproj.CRS("+proj=tmerc +lon_0=9 +x_0=3500000 +ellps=bessel").to_wkt("WKT1_GDAL")
+    ogr2ogr("-f", "GPKG", "-a_srs", open_datum, path, plain)
+    assert "to EPSG:32632 with an unknown error" in read(path).warnings[0]
+    taken, told = read(path, 'class = "building"\nepsg = 31467'), read(saved(tmp_path / "b.gpkg", stated))
+    assert taken.warnings[0].removeprefix("a") == told.warnings[0].removeprefix("b")
+    assert shapely.hausdorff_distance(taken.features.geometry[0], told.features.geometry[0]) < 0.002

@@ -218,6 +218,7 @@ REFUSED = {
      r"\(1, 2, 3\) by their colour interpretation, nir, red, green by their names"),
     "a building site": (Made((RGB,), profile={"crs": rasterio.crs.CRS.from_wkt(SITE)}), "'site', which is neither"),
     "metres from the Earth's centre": (Made((RGB,), profile={"crs": "EPSG:4978"}), "neither geographic nor projected"),
+    "an ellipsoid alone": (Made((RGB,), profile={"crs": "+proj=utm +zone=32 +ellps=bessel"}), "leaves the datum open"),
     "the Moon": (Made((RGB,), transform=Affine(1e-5, 0, 11, 0, -1e-5, 49), profile={"crs": "IAU_2015:30100"}),
      "cannot be projected to EPSG:32632"),
     "pixels without height": (Made((RGB,), transform=Affine(1, 0, WEST, 0, 0, NORTH)), "pixels of 0 m"),

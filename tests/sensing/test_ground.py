@@ -187,3 +187,9 @@ def test_a_file_that_is_no_raster_or_of_an_unknown_unit_or_place_is_refused(tmp_
 def test_ground_that_cannot_be_is_refused(make, words):
     with pytest.raises(CameraError, match=words):
         make()
+
+
+def test_heights_in_a_crs_that_leaves_the_datum_open_are_refused(tmp_path):
+    path = write_dem(tmp_path / "dem.tif", slope_of(), crs="+proj=utm +zone=32 +ellps=bessel")
+    with pytest.raises(CameraError, match="leaves the datum open"):
+        read_dem(path, GRID)

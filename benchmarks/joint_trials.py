@@ -4,32 +4,35 @@
     .venv/bin/python benchmarks/joint_trials.py --out out/joint-trials
     .venv/bin/python benchmarks/joint_trials.py --out out/joint-trials --arm sasgeo --arm sasgeo_gains
     .venv/bin/python benchmarks/joint_trials.py --out out/joint-trials-again --seed 4321 --arm sasgeo --arm sasgeo_gains
+    .venv/bin/python benchmarks/joint_trials.py --out out/joint-trials-again --seed 4321 --arm sasgeo~0.5 --arm sasgeo~1
     .venv/bin/python benchmarks/joint_trials.py --table docs/results/joint-trials.csv
 
 The first command draws views of 192 m of a train place of each train country (split `trials`) of the suites in `DRAWN`,
 learns from the places of the other half, asks each arm, and writes each answer; it resumes. `listed` is whether the
-truth is among the modes that the arm ranked. The last prints the table of stored answers: the share that is found
-within 25 m and 5 degrees, and flips to right and to wrong against `sasgeo_gains`, which ranks by Eq. 11 alone, or the
-arm of `--against`.
-Intervals are 95 %, by resampling places.
+truth is among the modes that the arm ranked. An arm with `~` and a share is one whose learned numbers are drawn to
+those by hand, by that share of their logits and logarithms: at 1 all are by hand. The last prints the table of stored
+answers: the share that is found within 25 m and 5 degrees, and flips to right and to wrong against `sasgeo_gains`,
+which ranks by Eq. 11 alone, or the arm of `--against`. Intervals are 95 %, by resampling places.
 """
 
 import argparse
 import csv
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from scipy import special
 
 import sasgeo_bench as sgb
 from benchmarks.open_numbers import places
 from sasgeo_bench.core.errors import SasgeoError
 from sasgeo_bench.geometry.pose import wrap_deg
 from sasgeo_bench.running.training_tasks import spread
+from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.variants import LISTED
 from sasgeo_bench.scoring.intervals import ClusterDraws, mean_interval
 from sasgeo_bench.tasks.query import base_of
@@ -50,6 +53,7 @@ DATED: Final = ("dreieich", "malabo")  # regions of the split with maps of sever
 LESSONS: Final = ("real-age", "clean", "local-warp")
 MOST, VIEW_M, RIGHT_M, RIGHT_DEG = 100, 192.0, 25.0, 5.0
 USUAL: Final = "sasgeo_gains"
+SHARES: Final = ("hit", "false_alarm", "missing")  # of the rates: chances, whose logits are mixed
 ARMS: Final = (
     "sasgeo",
     USUAL,
@@ -59,6 +63,8 @@ ARMS: Final = (
     "sasgeo_no_overlap",
     "sasgeo_overlap_always",
     "sasgeo_prior",
+    "sasgeo~0.5",
+    "sasgeo~1",
     "schmidt_segcorr",
     "raster_soft",
 )
@@ -134,6 +140,10 @@ def groups(out: Path) -> Iterator[tuple[str, sgb.Query, sgb.Truth]]:
 
 def learned(out: Path, arm: str, half: str) -> str | None:
     """Return what an arm learns from the places of the other half; learned once, and stored."""
+    arm, _, share = arm.partition("~")
+    if share:
+        text = learned(out, arm, half)
+        return None if text is None else drawn_to_hand(ScorerModel.from_text(text), float(share)).to_text()
     matcher: Any = sgb.load_matcher(arm)
     if not isinstance(matcher, sgb.Learner):
         return None
@@ -156,6 +166,39 @@ def learned(out: Path, arm: str, half: str) -> str | None:
     return path.read_text(encoding="utf-8")
 
 
+def drawn_to_hand(model: ScorerModel, share: float) -> ScorerModel:
+    """Return a model whose numbers lie between the learned ones, at a share of 0, and those by hand, at 1.
+
+    >>> hand = ScorerModel.by_hand(["building"])
+    >>> twice = replace(hand, scaling=4 * hand.scaling)
+    >>> (drawn_to_hand(twice, 0.5).scaling / hand.scaling).round(6).tolist(), drawn_to_hand(twice, 1.0) == hand
+    ([2.0], True)
+    """
+    hand = ScorerModel.by_hand(model.classes)
+
+    def between(one: Any, two: Any, name: str = "") -> Any:  # noqa: ANN401 - numbers or arrays of them
+        if name in SHARES:
+            odds = (special.logit(np.clip(value, 1e-6, 1 - 1e-6)) for value in (one, two))
+            return special.expit(np.average(list(odds), axis=0, weights=[1 - share, share]))
+        logs = (np.log(np.maximum(value, 1e-6)) for value in (one, two))
+        return np.exp(np.average(list(logs), axis=0, weights=[1 - share, share]))
+
+    def each(one: Any, two: Any, left_out: str = "") -> dict[str, float]:  # noqa: ANN401 - of a dataclass
+        both = ((item.name, getattr(one, item.name), getattr(two, item.name)) for item in fields(one))
+        return {name: float(between(a, b, name)) for name, a, b in both if name != left_out}
+
+    # How much of the ground a class covers is counted, not learned.
+    rates = [replace(one, **each(one, two, "mapped")) for one, two in zip(model.rates, hand.rates, strict=True)]
+    return replace(
+        model,
+        rates=tuple(rates),
+        likeness=np.average([model.likeness, hand.likeness], axis=0, weights=[1 - share, share]),
+        missed_share=np.average([model.missed_share, hand.missed_share], axis=0, weights=[1 - share, share]),
+        scaling=between(model.scaling, hand.scaling),
+        blend=replace(model.blend, **each(model.blend, hand.blend)),
+    )
+
+
 @cache
 def half_of(region: str) -> str:
     """Return the half of the split that a region is in."""
@@ -171,7 +214,7 @@ def ask(out: Path, arm: str, done: set[tuple[str, str]]) -> Iterator[Answer]:
         if (arm, query.query_id) in done or truth.pose is None:
             continue
         if query.region != on:
-            matcher, on = sgb.load_matcher(arm), query.region
+            matcher, on = sgb.load_matcher(arm.partition("~")[0]), query.region
             matcher.prepare(sgb.read_region(out / "regions" / on), learned(out, arm, half_of(on)))
         start = time.process_time()
         poses = matcher.match(query, top_k=LISTED).poses

@@ -9,7 +9,7 @@ from typing import Final
 
 import pandas as pd
 
-from sasgeo_bench.boards.board_tables import SHOWN_RISK, Book, is_ranked, risk_tables, short_cell
+from sasgeo_bench.boards.board_tables import SHOWN_RATIO, SHOWN_RISK, Book, is_ranked, risk_tables, short_cell
 from sasgeo_bench.boards.tables import (
     Cell,
     Column,
@@ -19,18 +19,22 @@ from sasgeo_bench.boards.tables import (
     Table,
     column,
     file_stem,
+    interval_text,
     number_cell,
     number_text,
     plain_cell,
     prior_words,
     rank_text,
+    records_of,
     suite_words,
     ties_of,
     word,
 )
 from sasgeo_bench.core.errors import counted
 from sasgeo_bench.scoring.compare import LEAST_PLACES
+from sasgeo_bench.scoring.controls import EVERY
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, primary_of
+from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.strata import ALL, STRESS
 from sasgeo_bench.tasks.query import BY, SEQUENCE
@@ -143,8 +147,11 @@ class Overview:
         """Return how each entry that was added compares with the one of the highest figure, on the first such suite."""
         return tuple(filter(None, (_compared(self.book, self.keys, name) for name in sorted(self.book.added))))
 
-    def trust(self, leaderboard: pd.DataFrame) -> str:
-        """Return how much may be trusted, of the matcher of `risk_tables` that was asked most; "" without rejectors."""
+    def trust(self, leaderboard: pd.DataFrame, acceptance: pd.DataFrame) -> str:
+        """Return how much may be trusted, of the matcher of `risk_tables` that was asked most; "" without rejectors.
+
+        `acceptance` is from `rejection.acceptance_frame`: what the same rejector makes of places that are not there.
+        """
         name = file_stem("risk", *self.group)
         table = next((table for table in risk_tables(leaderboard) if table.name == name), None)
         if table is None:
@@ -153,10 +160,27 @@ class Overview:
         matcher, rejector, answered, reached, kept, n = (cell.text for cell in row.cells)
         verdict = {"yes": "the risk is kept", "no": "the risk is not kept"}.get(kept, "the risk may be kept or not")
         who = f"{matcher} with the rejector {rejector}"
-        return (
+        text = (
             f"Where {100 * SHOWN_RISK:.0f} % of its answers may be false, {who} answers {answered} of {n} queries; of "
             f"these {reached} are false: {verdict}."
         )
+        return " ".join(filter(None, (text, self._refusal(acceptance, matcher, rejector))))
+
+    def _refusal(self, acceptance: pd.DataFrame, matcher: str, rejector: str) -> str:
+        """Return how many absent places a rejector refuses; "" if it gives no chances, or no place is absent."""
+        track, prior_group = self.group
+        for row in records_of(acceptance):
+            pair = (row["matcher"], row["rejector"], row["track"], row["prior_group"])
+            kind = (row["absence"], row["mixture"], row["cost_ratio"])
+            if pair == (matcher, rejector, track, prior_group) and kind == (EVERY, AS_DRAWN, SHOWN_RATIO):
+                accepted = [float(row[f"absent_accepted{end}"]) for end in ("", "_hi", "_lo")]
+                refused, lo, hi = (1.0 - share for share in accepted)
+                return (
+                    f"Where a false fix costs {SHOWN_RATIO:g} times as much as no fix, it refuses "
+                    f"{interval_text(refused, lo, hi)} of {counted(int(row['absent']), 'absent place')}, and answers "
+                    f"{number_text(float(row['right_present']))} of the others, and rightly."
+                )
+        return ""
 
 
 def overviews_of(book: Book) -> tuple[Overview, ...]:

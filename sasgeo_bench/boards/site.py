@@ -158,6 +158,7 @@ def _index(site: Site) -> dict[str, object]:
         "overviews": overviews_of(book),
         "few_rule": FEW_RULE,
         "leaderboard": source.board.leaderboard,
+        "acceptance": source.board.acceptance,
         "ranks_note": RANKS_NOTE,
         "contrasts": contrasts,
         "outcomes": {outcome: count for outcome, count in counts.items() if count},

@@ -359,7 +359,7 @@ def show_board(board: Board) -> None:
     for item in overviews_of(shown.book):
         say(item.shown.title)
         print_table(table_text(item.shown))
-        for line in (*overview_lines(item), *filter(None, (item.trust(board.leaderboard),))):
+        for line in (*overview_lines(item), *filter(None, (item.trust(board.leaderboard, board.acceptance),))):
             say(line)
     for line in contrast_lines(board.findings):
         say(line)

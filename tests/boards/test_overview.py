@@ -15,6 +15,9 @@ from sasgeo_bench.boards.publish import publish
 from sasgeo_bench.boards.text import contrast_lines
 from sasgeo_bench.cli.boards import show_board
 from sasgeo_bench.scoring.compare import Finding
+from sasgeo_bench.scoring.intervals import BoardInterval
+from sasgeo_bench.scoring.rejection import ACCEPTANCE_SCHEMA, Accepted
+from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, Row
 from tests.handmade import HOSTILE, SHARES, about_of, entry_of, full_board
 
@@ -160,7 +163,7 @@ def test_what_is_unsolved_is_what_the_highest_figure_leaves_of_the_ceiling():
     assert item.unsolved == "Nothing is left on clean."
 
 
-def test_what_may_be_trusted_is_said_of_who_was_asked_most():
+def test_what_may_be_trusted_is_said_of_who_was_asked_most_and_of_absent_places():
     figures = {"aurc": 0.1, "coverage_at_risk_0.05": 0.6, "risk_reached_at_0.05": 0.04}
     more = {"suite": "all suites", "rejector": "own", "stratum": "as drawn"}
     rows = [
@@ -171,11 +174,48 @@ def test_what_may_be_trusted_is_said_of_who_was_asked_most():
     rows += [row("a", 0.5, (1, 2)), row("easy", 0.4, (1, 2))]
     table = FIGURE_SCHEMA.frame(rows)
     (item,) = overviews_of(Book.of(table))
-    assert item.trust(table) == (
+    trusted = (
         "Where 5 % of its answers may be false, a with the rejector own answers 0.600 [0.500, 0.700] of 90 queries; of "
         "these 0.040 [0.000, 0.140] are false: the risk may be kept or not."
     )
-    assert item.trust(table[table["rejector"] == ""]) == ""
+    assert item.trust(table, ACCEPTANCE_SCHEMA.empty()) == trusted
+    assert item.trust(table[table["rejector"] == ""], ACCEPTANCE_SCHEMA.empty()) == ""
+
+    accepted = [
+        refusal("a", "own", 0.25),
+        *(refusal("a", "own", 0.9, **{name: other}) for name, other in OF_ANOTHER.items()),
+        refusal("easy", "own", 0.9),
+        refusal("a", "margin", 0.9),
+    ]
+    assert item.trust(table, ACCEPTANCE_SCHEMA.frame(accepted)) == (
+        f"{trusted} Where a false fix costs 20 times as much as no fix, it refuses 0.750 [0.650, 0.850] of 8 absent "
+        "places, and answers 0.500 of the others, and rightly."
+    )
+    assert item.trust(table, ACCEPTANCE_SCHEMA.frame(accepted[1:])) == trusted
+
+
+OF_ANOTHER = {
+    "absence": "absent: outside",
+    "mixture": "half present",
+    "cost_ratio": 5.0,
+    "track": "retrieval",
+    "prior_group": "r250-weak-s3",
+}
+
+
+def refusal(matcher, rejector, share, **changes):
+    """What Eq. 14 accepts of absent places."""
+    values = {"track": "localization", "prior_group": PRIOR, "mixture": AS_DRAWN, "absence": "all", "cost_ratio": 20.0}
+    values |= {
+        "n": 90,
+        "absent": 8,
+        "places": 12,
+        "coverage": BoardInterval(value=0.6),
+        "risk": BoardInterval(value=0.1),
+    }
+    values |= {"right_present": BoardInterval(value=0.5)}
+    values |= {"absent_accepted": BoardInterval(value=share, lo=share - 0.1, hi=share + 0.1)}
+    return Accepted(matcher=matcher, rejector=rejector, **(values | changes))
 
 
 def test_groups_of_more_ranked_suites_come_first_and_each_has_its_own_table():

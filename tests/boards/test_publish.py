@@ -412,7 +412,7 @@ def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path)
     with reporting(lines.append):
         pages = read(publish(tmp_path / "mine").folder)
     assert lines == ["not on the map of places, for no region of that name ships or is built in out: my-town"]
-    assert "This version knows no suite of that name" in " ".join(pages["suite-nobodys-suite.html"].said("p"))
+    assert "No suite of this version has that name" in " ".join(pages["suite-nobodys-suite.html"].said("p"))
     assert "nobodys-suite: localization, my-group" in pages["index.html"].said("h3")
     assert "It has no figure on this board." in pages["matcher-unasked.html"].said("p")
     assert pages["index.html"].said("h1") == ["mine: A title of mine"]

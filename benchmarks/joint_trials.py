@@ -8,11 +8,12 @@
     .venv/bin/python benchmarks/joint_trials.py --table docs/results/joint-trials.csv
 
 The first command draws views of 192 m of a train place of each train country (split `trials`) of the suites in `DRAWN`,
-learns from the places of the other half, asks each arm, and writes each answer; it resumes. `listed` is whether the
-truth is among the modes that the arm ranked. An arm with `~` and a share is one whose learned numbers are drawn to
-those by hand, by that share of their logits and logarithms: at 1 all are by hand. The last prints the table of stored
-answers: the share that is found within 25 m and 5 degrees, and flips to right and to wrong against `sasgeo_gains`,
-which ranks by Eq. 11 alone, or the arm of `--against`. Intervals are 95 %, by resampling places.
+and views of 96 m of all train places that have look-alikes; learns from the places of the other half, asks each arm,
+and writes each answer; it resumes. `listed` is whether the truth is among the modes that the arm ranked. An arm with
+`~` and a share is one whose learned numbers are drawn to those by hand, by that share of their logits and logarithms:
+at 1 all are by hand. The last prints the table of stored answers: the share that is found within 25 m and 5 degrees,
+and flips to right and to wrong against `sasgeo_gains`, which ranks by Eq. 11 alone, or the arm of `--against`.
+Intervals are 95 %, by resampling places.
 """
 
 import argparse
@@ -38,7 +39,7 @@ from sasgeo_bench.scoring.intervals import ClusterDraws, mean_interval
 from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 
-SPLIT, SEED, PRIOR = "trials", 1234, "r500-weak-s3"
+SPLIT, WORLD, SEED, PRIOR = "trials", "world", 1234, "r500-weak-s3"
 DRAWN: Final = {  # sites of each region, by suite
     "clean": 6,
     "volatile-lure": 4,
@@ -48,8 +49,10 @@ DRAWN: Final = {  # sites of each region, by suite
     "topology-twins": 1,
     "instance-twins": 1,
     "real-age": 8,
+    "natural-twins": 4,
 }
 DATED: Final = ("dreieich", "malabo")  # regions of the split with maps of several dates
+TWINS: Final = "natural-twins"  # few places have some, so all train places are looked at
 LESSONS: Final = ("real-age", "clean", "local-warp")
 MOST, VIEW_M, RIGHT_M, RIGHT_DEG = 100, 192.0, 25.0, 5.0
 USUAL: Final = "sasgeo_gains"
@@ -62,6 +65,8 @@ ARMS: Final = (
     "sasgeo_no_amounts",
     "sasgeo_no_overlap",
     "sasgeo_overlap_always",
+    "sasgeo_graph_alone",
+    "sasgeo_no_graph",
     "sasgeo_prior",
     "sasgeo~0.5",
     "sasgeo~1",
@@ -78,6 +83,7 @@ ASKED: Final = (
     ("occlusion", "stress", "U4"),
     ("topology-twins", "stress", ""),
     ("instance-twins", "stress", ""),
+    (TWINS, "stress", "N1 vectors"),
 )
 
 
@@ -106,15 +112,31 @@ class _Lesson:
         return self.query.query_id
 
 
+@cache
+def countries() -> dict[str, str]:
+    """Return the first region of each train place of the world, with its country."""
+    listed = read_split_file(find_split_file(WORLD)).place
+    return {place.region_ids[0]: place.country or place.name for place in listed if place.part == "train"}
+
+
 def draw(out: Path, seed: int) -> None:
     """Draw the views of all suites; a region of which there are some is left alone."""
+    on = {"real-age": DATED, TWINS: tuple(countries())}
     for suite, sites in DRAWN.items():
         there = {base_of(folder.name) for folder in (out / "tasks" / suite).glob("*")}
-        wanted = [name for name in (DATED if suite == "real-age" else places()) if name not in there]
+        wanted = [name for name in on.get(suite, tuple(places())) if name not in there]
         prior = {"prior": PRIOR} if suite in ("clean", "volatile-lure", "absent") else {}
         if wanted:
             sgb.make_tasks(
-                suite=[suite], regions=wanted, split=SPLIT, n=sites, seed=seed, out=out, up_to=True, skip=True, **prior
+                suite=[suite],
+                regions=wanted,
+                split=WORLD if suite == TWINS else SPLIT,
+                n=sites,
+                seed=seed,
+                out=out,
+                up_to=True,
+                skip=True,
+                **prior,
             )
 
 
@@ -133,7 +155,8 @@ def groups(out: Path) -> Iterator[tuple[str, sgb.Query, sgb.Truth]]:
         for query, truth in pairs(out, suite):
             is_meant = truth.role == role and truth.kind.removeprefix("unrivalled ").startswith(kind)
             is_meant &= suite != "clean" or truth.strength >= 1
-            if is_meant and truth.is_present and truth.pose and round(max(query.evidence.size_m)) == VIEW_M:
+            is_meant &= suite == TWINS or round(max(query.evidence.size_m)) == VIEW_M
+            if is_meant and truth.is_present and truth.pose:
                 at = f" x{truth.strength:g}" if suite == "clean" else ""
                 yield f"{suite}{at}{'' if role == 'stress' else ' ' + role}", query, truth
 
@@ -201,9 +224,11 @@ def drawn_to_hand(model: ScorerModel, share: float) -> ScorerModel:
 
 @cache
 def half_of(region: str) -> str:
-    """Return the half of the split that a region is in."""
+    """Return the half of the split that the country of a region is in; "a" of a country that it does not have."""
     listed = read_split_file(find_split_file(SPLIT)).place
-    return next(str(place.half) for place in listed if base_of(region) in place.region_ids)
+    own = next((place for place in listed if base_of(region) in place.region_ids), None)
+    country = own.country if own else countries().get(base_of(region))
+    return str(next((place.half for place in listed if place.country == country), "a"))
 
 
 def ask(out: Path, arm: str, done: set[tuple[str, str]]) -> Iterator[Answer]:

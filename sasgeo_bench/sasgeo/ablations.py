@@ -26,10 +26,11 @@ class Switches:
     weight. `is_stamped`, Eq. 5 for each feature, weighs features by the time since their last edit. Unless it
     `knows_age`, every map counts as new, which separates stability from fitted weights. Unless it `knows_season`, every
     view is weighed as one of no season. Unless it `learns_from_old`, training views on an older map are moved to the
-    map of their own day. `burns_vectors` reads the perceived vectors as a second raster view, so that an arm without a
-    graph sees what one with a graph sees. `correlates` says when errors of a class are taken to hang together ("faint":
-    in views with probabilities), else each cell counts alone: see `raster.RasterView.levelled` and `damped`.
-    `reads_probabilities` of views that have some, else each cell is the likelier of present and absent.
+    map of their own day. `burns_vectors` reads the perceived vectors as a second raster view, beside their graph or in
+    place of it, so that an arm without a graph sees what one with a graph sees. `correlates` says when errors of a
+    class are taken to hang together ("faint": in views with probabilities), else each cell counts alone: see
+    `raster.RasterView.levelled` and `damped`. `reads_probabilities` of views that have some, else each cell is the
+    likelier of present and absent.
 
     The last four are of certain views in which errors hang together. `searches_overlap` adds the overlap of view and
     map to the template of the search, so that its list holds places that gains alone miss. `weighs_prior`,
@@ -45,7 +46,7 @@ class Switches:
     knows_age: bool = True
     knows_season: bool = True
     learns_from_old: bool = True
-    burns_vectors: bool = False
+    burns_vectors: bool = True
     correlates: Correlated = "always"
     reads_probabilities: bool = True
     searches_overlap: bool = True

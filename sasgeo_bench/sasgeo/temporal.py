@@ -153,7 +153,7 @@ class SasgeoTrack:
     """
 
     card: MatcherCard
-    switches: ClassVar[Switches] = Switches(has_graph=False, correlates="faint")
+    switches: ClassVar[Switches] = Switches(has_graph=False, burns_vectors=False, correlates="faint")
     over_time: ClassVar[OverTime] = OverTime()
     exponent_scale: float = FRESH
     outlier_probability: float = NONE

@@ -88,7 +88,7 @@ class SasgeoTrackEven(_Base):
         _RIVAL,
         equations="Eqs. 7-8, 10-12",
     )
-    switches = Switches(weights="even", has_graph=False, correlates="faint")
+    switches = Switches(weights="even", has_graph=False, burns_vectors=False, correlates="faint")
 
 
 class SasgeoTrackAgeless(_Base):
@@ -101,7 +101,7 @@ class SasgeoTrackAgeless(_Base):
         _NONE,
         _RIVAL,
     )
-    switches = Switches(knows_age=False, has_graph=False, correlates="faint")
+    switches = Switches(knows_age=False, has_graph=False, burns_vectors=False, correlates="faint")
 
 
 class SasgeoTrackBlind(_Base):
@@ -114,4 +114,4 @@ class SasgeoTrackBlind(_Base):
         _NONE,
         _RIVAL,
     )
-    switches = Switches(is_unknown_silent=False, has_graph=False, correlates="faint")
+    switches = Switches(is_unknown_silent=False, has_graph=False, burns_vectors=False, correlates="faint")

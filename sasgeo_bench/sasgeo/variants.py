@@ -237,8 +237,10 @@ _LIMITS: Final = (
 )
 _BURNT: Final = (
     "perceived vectors burnt as a second view, lines in the median width of their class; where layers and vectors both "
-    "show a class, each counts half: the rival of the graph with the same sensor"
+    "show a class, each counts half"
 )
+_NOT_BURNT: Final = "of perceived vectors the graph alone is read, as in version 6 of `sasgeo`"
+_RIVAL: Final = "the rival of the graph with the same sensor"
 _BURNT_LIMITS: Final = "of vectors it reads where they lie, not how they connect or pass over each other"
 _SOFT: Final = (
     "a cell seen with a probability has the logarithm of its expected likelihood ratio, so that a certain one counts "
@@ -272,12 +274,15 @@ def _card(
     terms: Sequence[str] = _TERMS,
 ) -> MatcherCard:
     has_graph = bool({_GRAPH_FITTED, _GRAPH_BY_HAND}.intersection(ours))
+    has_both = has_graph and _BURNT in ours
     is_soft, is_correlated = reads == _SOFT, _CORRELATED in ours
     ranked = (_RANKED,) if is_soft and is_correlated else ()
     beside = tuple(terms) if is_correlated else ()
     return MatcherCard(
         name=name,
-        version=str(1 + is_soft + is_correlated + has_graph + len(ranked) + (terms is _TERMS and is_correlated)),
+        version=str(
+            1 + is_soft + is_correlated + has_graph + len(ranked) + (terms is _TERMS and is_correlated) + has_both
+        ),
         title=title,
         source=f"SASGeo paper (Trukhina and Vashkelis), {what}",
         ours="; ".join((_OURS, reads, *ranked, *beside, *ours)),
@@ -288,10 +293,16 @@ def _card(
 
 
 def _whole(
-    name: str, title: str, *ours: str, limits: str = _UNTAUGHT, reads: str = _SOFT, terms: Sequence[str] = _TERMS
+    name: str,
+    title: str,
+    *ours: str,
+    limits: str = _UNTAUGHT,
+    reads: str = _SOFT,
+    terms: Sequence[str] = _TERMS,
+    vectors: Sequence[str] = (_GRAPH_FITTED, _BURNT),
 ) -> MatcherCard:
     """Return the card of the whole scorer, taught, with something changed."""
-    told = (_FITTED, _CORRELATED, *ours, _GRAPH_FITTED, _SILENT)
+    told = (_FITTED, _CORRELATED, *ours, *vectors, _SILENT)
     return _card(name, title, "Eqs. 5, 7-9, 11-14", *told, limits=limits, reads=reads, terms=terms)
 
 
@@ -299,7 +310,7 @@ class SasgeoRaster(SasgeoMatcher):
     """Raster alone, uniform weights."""
 
     card = _card("sasgeo_raster", "SASGeo: raster, uniform weights", "Eqs. 7-8", _EVEN, _CORRELATED, _BLIND)
-    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=False)
 
 
 class SasgeoRasterVectors(SasgeoMatcher):
@@ -312,10 +323,11 @@ class SasgeoRasterVectors(SasgeoMatcher):
         _EVEN,
         _CORRELATED,
         _BURNT,
+        _RIVAL,
         _BLIND,
         limits=f"{_BURNT_LIMITS}; {_LIMITS}",
     )
-    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=True)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False)
 
 
 class SasgeoGraph(LearningMatcher):
@@ -328,6 +340,7 @@ class SasgeoGraph(LearningMatcher):
         _EVEN,
         _CORRELATED,
         _GRAPH_FITTED,
+        _BURNT,
         _BLIND,
         limits=f"without train places rules and weights of the graph are those set by hand; {_LIMITS}",
     )
@@ -344,6 +357,7 @@ class SasgeoStability(LearningMatcher):
         _FITTED,
         _CORRELATED,
         _GRAPH_FITTED,
+        _BURNT,
         _BLIND,
         limits=_UNTAUGHT,
     )
@@ -353,9 +367,7 @@ class SasgeoStability(LearningMatcher):
 class Sasgeo(LearningMatcher):
     """The whole scorer."""
 
-    card = _card(
-        "sasgeo", "SASGeo, whole", "Eqs. 5, 7-9, 11-14", _FITTED, _CORRELATED, _GRAPH_FITTED, _SILENT, limits=_UNTAUGHT
-    )
+    card = _whole("sasgeo", "SASGeo, whole")
     switches = Switches()
 
 
@@ -369,6 +381,7 @@ class SasgeoEven(LearningMatcher):
         _EVEN,
         _CORRELATED,
         _GRAPH_FITTED,
+        _BURNT,
         _SILENT,
         limits=f"without train places rules and weights of the graph are those set by hand; {_LIMITS}",
     )
@@ -386,6 +399,7 @@ class SasgeoPrior(SasgeoMatcher):
         "Eq. 5, and of a detector that is mostly right; one cell in a hundred counts",
         _CORRELATED,
         _GRAPH_BY_HAND,
+        _BURNT,
         _SILENT,
     )
     switches = Switches()
@@ -402,6 +416,7 @@ class SasgeoDistinct(LearningMatcher):
         _CORRELATED,
         "cells weigh by -log of the share of the map's configurations that are of their kind (Eq. 6)",
         _GRAPH_FITTED,
+        _BURNT,
         _SILENT,
         limits=_UNTAUGHT,
     )
@@ -490,10 +505,18 @@ class SasgeoNoGraph(LearningMatcher):
         _FITTED,
         _CORRELATED,
         _BURNT,
+        _RIVAL,
         _SILENT,
         limits=f"{_BURNT_LIMITS}; {_UNTAUGHT}",
     )
-    switches = Switches(has_graph=False, burns_vectors=True)
+    switches = Switches(has_graph=False)
+
+
+class SasgeoGraphAlone(LearningMatcher):
+    """The whole scorer that reads perceived vectors as a graph alone."""
+
+    card = _whole("sasgeo_graph_alone", "SASGeo, vectors as a graph alone", vectors=(_GRAPH_FITTED, _NOT_BURNT))
+    switches = Switches(burns_vectors=False)
 
 
 class SasgeoIndependent(LearningMatcher):
@@ -506,6 +529,7 @@ class SasgeoIndependent(LearningMatcher):
         _FITTED,
         "each cell counts alone, as in version 1 of `sasgeo`: it tells what correlated errors are worth",
         _GRAPH_FITTED,
+        _BURNT,
         _SILENT,
         limits=_UNTAUGHT,
     )
@@ -531,8 +555,11 @@ class SasgeoGains(LearningMatcher):
         "sasgeo_gains",
         "SASGeo by its gains alone",
         terms=(_GAINS,),
+        vectors=(_GRAPH_FITTED, _NOT_BURNT),
     )
-    switches = Switches(searches_overlap=False, weighs_prior=False, weighs_amounts=False, weighs_overlap="never")
+    switches = Switches(
+        burns_vectors=False, searches_overlap=False, weighs_prior=False, weighs_amounts=False, weighs_overlap="never"
+    )
 
 
 class SasgeoGainsSearch(LearningMatcher):

@@ -21,19 +21,20 @@ OURS = ("searches_overlap", "weighs_prior", "weighs_amounts", "weighs_overlap")
 def test_each_arm_leaves_out_one_thing_and_the_usual_one_all():
     changed = {}
     for name in ARMS:
-        switches = getattr(sgb.load_matcher(name), "switches", None)
+        switches = None if "~" in name else getattr(sgb.load_matcher(name), "switches", None)
         if switches is not None:
             changed[name] = {key for key, value in asdict(switches).items() if value != asdict(Switches())[key]}
-    assert changed.pop(USUAL) == set(OURS)
+    assert changed.pop(USUAL) == {*OURS, "burns_vectors"}  # as it was before
     assert not changed.pop("sasgeo")
     assert not changed.pop("sasgeo_prior")  # untaught
     assert {len(one) for one in changed.values()} == {1}
-    assert set().union(*changed.values()) == set(OURS)
+    assert set().union(*changed.values()) == {*OURS, "burns_vectors", "has_graph"}
     assert Sasgeo.switches == Switches()
 
 
 def test_cards_say_which_terms_an_arm_has():
-    texts = {name: sgb.load_matcher(name).card for name in ARMS if name.startswith("sasgeo") and name != "sasgeo_prior"}
+    taught = [name for name in ARMS if name.startswith("sasgeo") and name != "sasgeo_prior" and "~" not in name]
+    texts = {name: sgb.load_matcher(name).card for name in taught}
     assert len({card.ours for card in texts.values()}) == len(texts)
     assert texts[USUAL].version < texts["sasgeo"].version
     assert all("overlap" in texts[name].ours for name in ("sasgeo", "sasgeo_overlap_always"))

@@ -112,7 +112,7 @@ CLAIMS: Final = (
         "- and where a detector is silent as real ones were", "places-silent", "unknown", "silence measured elsewhere"
     ),
     Claim(
-        "More features than the margin reject better, kinds of absence pooled",
+        "More features than the margin order answers better, by E-AURC, kinds of absence pooled",
         "places",
         "rejection-natural",
         "more countries to be fitted on",

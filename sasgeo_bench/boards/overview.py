@@ -9,8 +9,17 @@ from typing import Final
 
 import pandas as pd
 
-from sasgeo_bench.boards.board_tables import SHOWN_RATIO, SHOWN_RISK, Book, is_ranked, risk_tables, short_cell
+from sasgeo_bench.boards.board_tables import (
+    SHOWN_RATIO,
+    SHOWN_RISK,
+    Book,
+    is_ranked,
+    risk_tables,
+    risk_tables_by_suite,
+    short_cell,
+)
 from sasgeo_bench.boards.tables import (
+    DAGGER,
     Cell,
     Column,
     Key,
@@ -157,14 +166,28 @@ class Overview:
         if table is None:
             return ""
         row = max(table.rows, key=lambda row: row.cells[-1].key or 0)  # the others were asked less, which may be easier
-        matcher, rejector, answered, reached, kept, n = (cell.text for cell in row.cells)
+        matcher, rejector, answered, reached, kept, n = (cell.text.replace(DAGGER, "") for cell in row.cells)
         verdict = {"yes": "the risk is kept", "no": "the risk is not kept"}.get(kept, "the risk may be kept or not")
-        who = f"{matcher} with the rejector {rejector}"
+        who = f"{matcher} with the rejector {rejector}, which orders its answers best,"
         text = (
             f"Where {100 * SHOWN_RISK:.0f} % of its answers may be false, {who} answers {answered} of {n} queries; of "
-            f"these {reached} are false: {verdict}."
+            f"these {reached} are false{self._worst(leaderboard, matcher, rejector)}: {verdict}."
         )
         return " ".join(filter(None, (text, self._refusal(acceptance, matcher, rejector))))
+
+    def _worst(self, leaderboard: pd.DataFrame, matcher: str, rejector: str) -> str:
+        """Return on which suite most of the answers are false, of several; all suites together hide it."""
+        name = file_stem("risk-by-suite", *self.group)
+        table = next((table for table in risk_tables_by_suite(leaderboard) if table.name == name), None)
+        rows = () if table is None else table.rows
+        own = next((row for row in rows if [cell.text for cell in row.cells[:2]] == [matcher, rejector]), None)
+        if table is None or own is None:
+            return ""
+        cells = zip(table.columns, own.cells, strict=True)
+        suites = {key[0] for key in self.book.matchers}
+        shares = [(cell.key, one.name) for one, cell in cells if one.name in suites and cell.key is not None]
+        share, suite = max(shares, default=(math.nan, ""))
+        return f", on {suite} {number_text(share)}" if len(shares) > 1 else ""
 
     def _refusal(self, acceptance: pd.DataFrame, matcher: str, rejector: str) -> str:
         """Return how many absent places a rejector refuses; "" if it gives no chances, or no place is absent."""
@@ -255,7 +278,11 @@ def _standing(book: Book, key: Key) -> str:
         ends = dict.fromkeys((values[first[-1]], values[first[0]]))
         count = ("both" if len(first) == 2 else f"all {len(first)}") if not behind else str(len(first))
         text = f"{count} share the first rank ({' to '.join(ends)}): {_names(first)}"
-    return f"{text}; {_names(behind)} {'is' if len(behind) == 1 else 'are'} behind" if behind else text
+    if not behind:
+        return text
+    # Ranks are of pairs: who is behind one of those that share the first rank need not be behind each.
+    told = "behind" if len(first) == 1 else "behind at least one of them"
+    return f"{text}; {_names(behind)} {'is' if len(behind) == 1 else 'are'} {told}"
 
 
 def _names(names: Sequence[str]) -> str:
@@ -323,7 +350,7 @@ def _matrix(book: Book, keys: Sequence[Key], stem: str, title: str, *, has_ranks
             replace(_suite_column(book, key, primary, has_absent=key in absent), order="none" if at else "descending")
             for at, key in enumerate(keys)
         ),
-        *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
+        *(column("false fixes", title=f"{key[0]}: false fixes without rejector") for key in absent),
         *(replace(book.column(limit), name=limit if len(keys) == 1 else f"{key[0]}: {limit}") for key, limit in limits),
     )
     return Table(

@@ -239,7 +239,12 @@ def _method(site: Site) -> dict[str, object]:
 
 PAGES: Final = (  # in the order of the navigation
     Page("index.html", "Board", _index),
-    Page("kinds-of-place.html", "Kinds of place", is_there=lambda site: site.tables["kinds-of-place.html"]["kinds"]),
+    Page(
+        "kinds-of-place.html",
+        "Kinds of place",
+        lambda site: {"made_of": _made_of(site.book)},
+        is_there=lambda site: site.tables["kinds-of-place.html"]["kinds"],
+    ),
     Page("suites.html", "Suites"),
     Page("matchers.html", "Matchers"),
     Page(

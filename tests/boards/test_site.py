@@ -500,7 +500,11 @@ def test_false_fixes_stand_beside_the_success_of_a_suite_with_absent_places():
     (table,) = (
         item.shown for item in overviews_of(book_of(source(pd.concat([many_rows(3), absent], ignore_index=True))))
     )
-    assert [column.name for column in table.columns] == ["matcher", "real-age: on the map", "real-age: false fixes"]
+    assert [column.name for column in table.columns] == [
+        "matcher",
+        "real-age: on the map",
+        "real-age: false fixes without rejector",
+    ]
     heads, first, *_ = table.rows
     assert [cell.text for cell in heads.cells] == ["queries", "80", "30"]
     assert (first.cells[2].details, first.cells[2].tone) == (("[0.90, 1.00]",), "plain")  # no rank, and nobody leads

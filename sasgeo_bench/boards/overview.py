@@ -281,8 +281,9 @@ def _standing(book: Book, key: Key) -> str:
     if not behind:
         return text
     # Ranks are of pairs: who is behind one of those that share the first rank need not be behind each.
-    told = "behind" if len(first) == 1 else "behind at least one of them"
-    return f"{text}; {_names(behind)} {'is' if len(behind) == 1 else 'are'} {told}"
+    if len(first) > 1:
+        return f"{text}; behind at least one: {_names(behind)}"
+    return f"{text}; {_names(behind)} {'is' if len(behind) == 1 else 'are'} behind"
 
 
 def _names(names: Sequence[str]) -> str:
@@ -350,7 +351,7 @@ def _matrix(book: Book, keys: Sequence[Key], stem: str, title: str, *, has_ranks
             replace(_suite_column(book, key, primary, has_absent=key in absent), order="none" if at else "descending")
             for at, key in enumerate(keys)
         ),
-        *(column("false fixes", title=f"{key[0]}: false fixes without rejector") for key in absent),
+        *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
         *(replace(book.column(limit), name=limit if len(keys) == 1 else f"{key[0]}: {limit}") for key, limit in limits),
     )
     return Table(
@@ -392,8 +393,8 @@ def _notes(primary: str, rows: Sequence[Row], *, has_absent: bool, has_several: 
         )
     if has_absent:
         yield (
-            f"false fixes: {column('false fixes').meaning}. The figure of the suite itself is of its places that are "
-            "on the map."
+            f"false fixes, without a rejector: {column('false fixes').meaning}. The figure of the suite itself is of its "
+            "places that are on the map."
         )
     if any(row.cells[0].text == AT_MOST for row in rows):
         yield (

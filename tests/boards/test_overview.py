@@ -47,7 +47,7 @@ def said(*rows, **changes):
     [
         (
             {"a": (0.7, (1, 2)), "b": (0.6, (1, 2)), "c": (0.1, (3, 3))},
-            "clean: 2 share the first rank (0.600 to 0.700): a and b; c is behind at least one of them.",
+            "clean: 2 share the first rank (0.600 to 0.700): a and b; behind at least one: c.",
         ),
         (
             {"a": (0.7, (1, 1)), "b": (0.6, (2, 3)), "c": (0.5, (2, 3))},
@@ -175,8 +175,8 @@ def test_what_may_be_trusted_is_said_of_who_was_asked_most_and_of_absent_places(
     table = FIGURE_SCHEMA.frame(rows)
     (item,) = overviews_of(Book.of(table))
     trusted = (
-        "Where 5 % of its answers may be false, a with the rejector own, which orders its answers best, answers 0.600 [0.500, 0.700] of 90 queries; of "
-        "these 0.040 [0.000, 0.140] are false: the risk may be kept or not."
+        "Where 5 % of its answers may be false, a with the rejector own, which orders its answers best, answers 0.600 "
+        "[0.500, 0.700] of 90 queries; of these 0.040 [0.000, 0.140] are false: the risk may be kept or not."
     )
     assert item.trust(table, ACCEPTANCE_SCHEMA.empty()) == trusted
     assert item.trust(table[table["rejector"] == ""], ACCEPTANCE_SCHEMA.empty()) == ""

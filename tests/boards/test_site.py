@@ -500,16 +500,15 @@ def test_false_fixes_stand_beside_the_success_of_a_suite_with_absent_places():
     (table,) = (
         item.shown for item in overviews_of(book_of(source(pd.concat([many_rows(3), absent], ignore_index=True))))
     )
-    assert [column.name for column in table.columns] == [
-        "matcher",
-        "real-age: on the map",
-        "real-age: false fixes without rejector",
-    ]
+    assert [column.name for column in table.columns] == ["matcher", "real-age: on the map", "real-age: false fixes"]
     heads, first, *_ = table.rows
     assert [cell.text for cell in heads.cells] == ["queries", "80", "30"]
     assert (first.cells[2].details, first.cells[2].tone) == (("[0.90, 1.00]",), "plain")  # no rank, and nobody leads
     assert "Lower is better" in table.columns[2].meaning
-    assert any(note.startswith("false fixes: Share of absent places that were answered") for note in table.notes)
+    assert any(
+        note.startswith("false fixes, without a rejector: Share of absent places that were answered")
+        for note in table.notes
+    )
 
 
 def test_a_ceiling_below_one_is_explained_with_the_oracle_that_passes_it():

@@ -393,8 +393,8 @@ def _notes(primary: str, rows: Sequence[Row], *, has_absent: bool, has_several: 
         )
     if has_absent:
         yield (
-            f"false fixes, without a rejector: {column('false fixes').meaning}. The figure of the suite itself is of its "
-            "places that are on the map."
+            f"false fixes, without a rejector: {column('false fixes').meaning}. The figure of the suite itself is of "
+            "its places that are on the map."
         )
     if any(row.cells[0].text == AT_MOST for row in rows):
         yield (

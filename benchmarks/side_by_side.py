@@ -195,7 +195,7 @@ ROWS: Final = (
         first=(("leaderboard", "demo", "--out", KEPT, "--results", f"{KEPT}/results"),),
         goal=0.3,
     ),
-    Row(name="make demo", words=("make", "demo"), goal=0.6),
+    Row(name="make demo", words=("make", "demo", f"OUT={FRESH}"), goal=0.6),
     Row(name="make test", words=("make", "test"), goal=0.65),
 )
 

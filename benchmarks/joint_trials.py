@@ -290,7 +290,13 @@ def lines(answers: Sequence[Answer], usual: str = USUAL) -> Iterator[str]:
         cells = [f"{np.median([one.view_s for one in own.values()]):.2f}"]
         for names in wanted.values():
             asked = [one for one in own.values() if one.group in names and one.query_id in of_arm.get(usual, {})]
-            cells.append(_cell(asked, [of_arm[usual][one.query_id] for one in asked], with_interval=len(names) > 1))
+            cells.append(
+                _cell(
+                    asked,
+                    [of_arm[usual][one.query_id] for one in asked],
+                    with_interval=len(names) > 1 or TWINS in names,
+                )
+            )
         yield f"| `{arm}` | {' | '.join(cells)} |"
 
 

@@ -12,9 +12,10 @@ import pandas as pd
 
 from sasgeo_bench.boards.archive import fits_folder, pack_board
 from sasgeo_bench.boards.archive_file import check_results
+from sasgeo_bench.boards.board_files import read_board_manifest
 from sasgeo_bench.boards.build import drawings, make_board
 from sasgeo_bench.boards.scored import Scored, ScoreRequest
-from sasgeo_bench.core.errors import ConfigError
+from sasgeo_bench.core.errors import ConfigError, StoreError
 from sasgeo_bench.core.progress import reporting, silent, tell
 from sasgeo_bench.experiments.pipeline_plan import (
     MOST_LINES,
@@ -61,6 +62,7 @@ def run_pipeline(
     stored = None if results is None else results / plan.spec.id
     if stored is not None:
         check_results(stored, board_folder(plan))
+    _tell_of_another(plan)
     rules_of(plan.spec.rejectors, plan.split)
     sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored)
     tasks, controls = draw_all(plan)
@@ -110,6 +112,20 @@ def draw_all(plan: PipelinePlan) -> tuple[list[Path], list[Path]]:
     if plan.spec.paper is not None and plan.experiment is not None:
         tasks += plan.experiment.draw(plan.spec.paper, out=plan.out, private=plan.private)
     return tasks, _draw(plan.controls, jobs=1)
+
+
+def _tell_of_another(plan: PipelinePlan) -> None:
+    """Say that a board is replaced which another file, or an earlier state of this one, has made."""
+    folder = board_folder(plan)
+    try:
+        there = read_board_manifest(folder).pipeline
+    except StoreError:  # there is none, or none that can be read
+        return
+    if there != plan.spec.identity:
+        tell(
+            f"{folder} holds the board of another file with the id {plan.spec.id!r}, or of this one as it was: it is "
+            "replaced; give yours an id of its own to keep both"
+        )
 
 
 def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: Sequence[Path]) -> None:

@@ -266,7 +266,11 @@ def _step(path: Path, crs: pyproj.CRS, grid: Grid) -> tuple[pyproj.Transformer, 
     is_rough = "Ballpark" in step.description
     if group.best_available and not is_rough and step.accuracy <= _ACCURATE_M:
         return step, ""
-    off = "an unknown error" if is_rough or step.accuracy < 0 else f"an error of about {step.accuracy:g} m"
+    off = (
+        "an unknown error, which may be a hundred metres,"
+        if is_rough or step.accuracy < 0
+        else f"an error of about {step.accuracy:g} m"
+    )
     missing = sorted({grid.full_name or grid.short_name for one in group.unavailable_operations for grid in one.grids})
     better = f"; a better way needs {named(missing, 'grid')} (projsync)" if missing else ""
     text = f"{path.name} goes from {one_line(crs.name)[:60]} to EPSG:{grid.epsg} with {off} ({step.description[:120]})"

@@ -222,6 +222,20 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     )
     assert f"    random: {count} answered, 0 to ask\n" in text
     assert "to be drawn" not in text
+    assert not any("it is replaced" in line for line in lines)
+
+
+def test_a_board_of_another_file_with_the_same_id_is_not_replaced_without_a_word(made):
+    plan, _, _ = made
+    other = plan_pipeline(small(**{'title = "Small"': 'title = "Other"'}), out=plan.out)
+    lines = []
+    with reporting(lines.append):
+        run_pipeline(other)
+        run_pipeline(plan)
+    folder = plan.out / "boards" / "small"
+    told = [line for line in lines if line.startswith(f"{folder} holds the board of another file with the id 'small'")]
+    assert len(told) == 2
+    assert told[0].endswith("it is replaced; give yours an id of its own to keep both")
 
 
 def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):

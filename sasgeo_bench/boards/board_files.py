@@ -4,7 +4,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, get_args
 
 import pandas as pd
 from pandas.api.types import is_numeric_dtype
@@ -30,10 +30,12 @@ from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, FALSIFIER_SCHEMA
 from sasgeo_bench.scoring.flights import SCORE_SCHEMA
 from sasgeo_bench.scoring.frames import Column, Schema
+from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA
 from sasgeo_bench.scoring.rejection import ACCEPTANCE_SCHEMA
 from sasgeo_bench.scoring.requirements import COMPLIANCE_SCHEMA
 from sasgeo_bench.scoring.rows import LEADERBOARD_SCHEMA
+from sasgeo_bench.tasks.query import Track
 
 LEADERBOARD: Final = "leaderboard"
 PROTECTION: Final = "protection"
@@ -193,8 +195,16 @@ def read_board_manifest(folder: Path) -> BoardManifest:
 
 
 def read_leaderboard(folder: Path) -> pd.DataFrame:
-    """Read every figure of a board; raise StoreError if the table is missing or damaged."""
-    return read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
+    """Read every figure of a board; raise StoreError if the table is missing, damaged or has a share beyond 0..1."""
+    path = folder / f"{LEADERBOARD}.parquet"
+    frame = read_frame(path, mend=MEND)
+    if {"metric", "value", "matcher"} <= set(frame) and is_numeric_dtype(frame["value"]):
+        shares = frame[frame["metric"].isin([primary_of(track).name for track in get_args(Track)])]
+        wrong = shares[shares["value"].notna() & ~shares["value"].between(0.0, 1.0)]
+        if len(wrong):
+            name, metric, value = wrong.iloc[0][["matcher", "metric", "value"]]
+            raise StoreError(f"{path}: {one_line(str(metric))} of {one_line(str(name))} is {value}, not 0..1: {MEND}")
+    return frame
 
 
 def read_scores(folder: Path) -> pd.DataFrame:

@@ -532,6 +532,18 @@ def test_damaged_files_of_a_board_are_one_line_and_nothing_is_written(own, mista
     assert not (own / "site").exists()
 
 
+@pytest.mark.parametrize("value", [7.5, -0.1, float("inf")])
+def test_a_share_beyond_its_range_is_one_line(own, mistake, value):
+    path = own / "leaderboard.parquet"
+    table = pd.read_parquet(path)
+    at = table.index[table["metric"] == "success_25m"][0]
+    table.loc[at, "value"] = value
+    table.to_parquet(path)
+    assert f"success_25m of {table.loc[at, 'matcher']} is {value}, not 0..1: score it again" in mistake(
+        "publish", "--board", own
+    )
+
+
 def test_a_refused_board_leaves_nothing_where_its_site_was_to_go(own, mistake, tmp_path):
     (own / "board.json").write_text("{}", encoding="utf-8")
     mistake("publish", "--board", own, "--into", tmp_path / "new" / "site")

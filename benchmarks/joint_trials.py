@@ -196,6 +196,10 @@ def drawn_to_hand(model: ScorerModel, share: float) -> ScorerModel:
     >>> twice = replace(hand, scaling=4 * hand.scaling)
     >>> (drawn_to_hand(twice, 0.5).scaling / hand.scaling).round(6).tolist(), drawn_to_hand(twice, 1.0) == hand
     ([2.0], True)
+    >>> sure = replace(hand, rates=(replace(hand.rates[0], hit=0.25),))  # chances are mixed by their odds
+    >>> odds = [one.rates[0].hit / (1 - one.rates[0].hit) for one in (sure, hand, drawn_to_hand(sure, 0.5))]
+    >>> round(odds[2] ** 2 / (odds[0] * odds[1]), 6)
+    1.0
     """
     hand = ScorerModel.by_hand(model.classes)
 
